@@ -22,7 +22,7 @@ from rich.table import Table
 
 from benchmarks.measure import Measurement, hardware
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.run import read_json, write_json
+from neilfpp_method.train.json_files import read_json, write_json
 
 __all__ = ["SUITES", "compare", "merged"]
 

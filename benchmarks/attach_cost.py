@@ -17,6 +17,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import PixelBatch, RayBatch
 
@@ -41,7 +42,7 @@ def loop(attached: bool) -> Callable[[PixelBatch, int], None]:
     """A training step of the host, with or without the add-on's losses in it."""
     torch.manual_seed(0)
     config = preset("fast")
-    host = VolSdfHost(config, 3.0, "constant")
+    host = VolSdfHost(config, SceneFacts("linear", 0.2, 3.0, "constant"))
     optimizer = torch.optim.Adam(host.parameters(), lr=1e-3)
     neilf = attach_neilf(Borrowed(host), config) if attached else None
 

@@ -37,7 +37,8 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.optimizer import adam, seed_step, set_rates
-from neilfpp_method.train.run import Run, load_run
+from neilfpp_method.train.request import TrainingRequest
+from neilfpp_method.train.run import Run, last_checkpoint, load_run
 
 TABLE = "borrowed-host"
 CELLS = 160
@@ -139,18 +140,16 @@ def main(options: Options) -> None:
     given = fixed_geometry(preset("fast"))
     given = dataclasses.replace(given, train=dataclasses.replace(given.train, material_steps=options.steps))
     on_mesh = options.out / options.capture.resolve().name
-    begun = (on_mesh / "checkpoints" / "last.pt").exists()
-    run_training(  # a finished run is not changed
+    begun = last_checkpoint(on_mesh).exists()
+    request = TrainingRequest(
         data=None if begun else options.capture,
         out=on_mesh,
         config=None if begun else given,
         resume=begun,
-        test_every=None,
-        response="auto",
         device="cpu",
-        devices=1,
-        console=Console(),
     )
+    # A finished run is not changed.
+    run_training(request, Console())
     pixels = PixelDataset(capture, capture.train_views)
     borrowed = dataclasses.replace(given, train=dataclasses.replace(given.train, sdf_steps=0))
     runs = {

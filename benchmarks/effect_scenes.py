@@ -87,8 +87,8 @@ def bowl() -> KnownScene:
     profile[[0, -1], 0] = 0
     shell = trimesh.creation.revolve(profile, sections=64)
     shell.apply_translation((0, 0, 0.35))
-    centre = shell.triangles_center
-    quarter = (centre[:, 0] > 0) + 2 * (centre[:, 1] > 0)
+    center = shell.triangles_center
+    quarter = (center[:, 0] > 0) + 2 * (center[:, 1] > 0)
     colors = [(0.75, 0.15, 0.1), (0.15, 0.65, 0.2), (0.15, 0.25, 0.75), (0.7, 0.7, 0.65)]
     parts = [
         Part(shell.submesh([np.nonzero(quarter == k)[0]], append=True), color, 0.3, 0.0)

@@ -21,7 +21,7 @@ import tyro
 from rich.console import Console
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.run import read_json
+from neilfpp_method.train.json_files import read_json
 
 __all__ = ["TRUE_EFFECTS", "markdown"]
 

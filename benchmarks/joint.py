@@ -47,7 +47,7 @@ BALLS = (((0.2, 0.1, 0.0), 0.35), ((-0.45, 0.0, -0.1), 0.25))  # centre and radi
 
 def table(x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
     """Signed distance, except at the edges, of a round table top with two balls on it."""
-    balls = [(x - x.new_tensor(centre)).norm(dim=-1) - radius for centre, radius in BALLS]
+    balls = [(x - x.new_tensor(center)).norm(dim=-1) - radius for center, radius in BALLS]
     top = torch.maximum((x[:, 2] + 0.4).abs() - 0.05, x[:, :2].norm(dim=-1) - 0.95)
     return torch.stack([*balls, top]).amin(0)
 
@@ -76,7 +76,7 @@ def fitted_model(config: NeilfConfig, like: VolSdfHost | None = None) -> NeilfMo
     )
     torch.manual_seed(0)
     facts = SceneFacts("linear", 0.2, 3.0, "constant")
-    host = VolSdfHost(config, facts.radiance_scale, facts.background)
+    host = VolSdfHost(config, facts)
     if like is None:
         fit_table(host.sdf_field)
     else:
@@ -95,8 +95,8 @@ def rays_at_the_table(count: int) -> PixelBatch:
         depth += table(origins + depth[:, None] * directions).clamp_min(0.0)
     rows = torch.nonzero(table(origins + depth[:, None] * directions).abs() < 1e-3)[:count, 0]
     flat = torch.zeros(count)
-    grey = torch.full((count, 3), 0.2)
-    return PixelBatch(origins[rows], directions[rows], grey, flat + 1.0, flat, flat, flat.long()).to(device())
+    gray = torch.full((count, 3), 0.2)
+    return PixelBatch(origins[rows], directions[rows], gray, flat + 1.0, flat, flat, flat.long()).to(device())
 
 
 def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:

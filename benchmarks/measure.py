@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import platform
 import statistics
 import subprocess
 import time
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+
+from neilfpp_method.train.environment import processor_name
 
 __all__ = [
     "Measurement",
@@ -96,7 +97,7 @@ def median_seconds(
 def hardware() -> str:
     """Description of the machine in one line."""
     gpu = torch.cuda.get_device_name() if torch.cuda.is_available() else "none"
-    return f"{_processor()}, {torch.get_num_threads()} thread(s), GPU {gpu}, torch {torch.__version__}"
+    return f"{processor_name()}, {torch.get_num_threads()} thread(s), GPU {gpu}, torch {torch.__version__}"
 
 
 def revision() -> str:
@@ -118,19 +119,6 @@ def revision() -> str:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.is_file():
-        names = [
-            line.split(":", 1)[1].strip()
-            for line in cpuinfo.read_text().splitlines()
-            if line.startswith("model name")
-        ]
-        if names:
-            return names[0]
-    return platform.processor() or platform.machine()
 
 
 def yardstick() -> None:

@@ -35,6 +35,7 @@ from neilfpp_method.data.scaling import scaled_camera
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.train.command import run_training
+from neilfpp_method.train.request import TrainingRequest
 
 FLOAT_PLANES = 19
 """Bytes per pixel of colours, masks and gradients in float32 and bool, as they were stored earlier."""
@@ -94,18 +95,15 @@ def train_small(data: Path, out: Path, scale: float | None, steps: int) -> None:
     """
     config = preset("fast")
     train = dataclasses.replace(config.train, sdf_steps=steps, material_steps=0, joint_steps=0)
-    run_training(
+    request = TrainingRequest(
         data=data,
         out=out,
         config=dataclasses.replace(config, train=train),
-        resume=False,
         test_every=0,
-        response="auto",
-        device="cpu",
-        devices=1,
         scale=scale,
-        console=Console(quiet=True),
+        device="cpu",
     )
+    run_training(request, Console(quiet=True))
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 
 

@@ -105,11 +105,11 @@ def scene_of(parts: list[Part], sky: Sky) -> Scene:
     """The parts as a scene of the path tracer: each point has the material of the part on which it lies."""
     triangles = torch.from_numpy(np.concatenate([part.mesh.triangles for part in parts]).astype(np.float32))
     rows = torch.tensor([[*part.base_color, part.roughness, part.metallic] for part in parts])
-    centres = torch.tensor([[-0.35, 0.0, 0.301], [0.35, -0.05, 0.301]])
+    centers = torch.tensor([[-0.35, 0.0, 0.301], [0.35, -0.05, 0.301]])
 
     def materials(x: Float[Tensor, "N 3"]) -> Material:
         number = torch.where(x[:, 2] > 1e-3, 1, 0)
-        near = torch.cdist(x, centres) < 0.302
+        near = torch.cdist(x, centers) < 0.302
         number = torch.where(near[:, 0], 2, torch.where(near[:, 1], 3, number))
         base_color, roughness, metallic = rows[number].split([3, 1, 1], dim=-1)
         return Material(base_color, roughness, metallic)

@@ -41,6 +41,7 @@ from neilfpp_method.relight.maps import read_map
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.surface import Surface
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
@@ -111,7 +112,7 @@ def true_surface(capture: Capture) -> Surface:
     mesh: Mesh | None = Truth(capture).mesh()
     if mesh is None:
         raise UserError(f"{capture.root}: no inputs/model/mesh.ply", "take a capture with its mesh")
-    host = MeshHost(mesh, NeilfConfig(), radiance_scale=1.0)
+    host = MeshHost(mesh, NeilfConfig(), SceneFacts("linear", 0.2, 1.0, "constant"))
     return Surface(host.triangles, host.corner_normals)
 
 

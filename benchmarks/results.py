@@ -35,15 +35,16 @@ from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.command import run_training
+from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import (
     create_run,
+    last_checkpoint,
     load_checkpoint,
     load_run,
     read_description,
-    read_json,
     save_checkpoint,
-    write_json,
 )
 
 STAGES = {"material_init": "material stage", "joint": "joint stage"}
@@ -113,18 +114,15 @@ def train(
     """Train a run from scratch or from the end of another run's SDF init; an existing run is continued."""
     if start_from is not None and not out.exists():
         branch(start_from, out, config)
-    run_training(
+    request = TrainingRequest(
         data=capture,
         out=out,
         config=config,
         resume=out.exists(),
         effects=None if out.exists() else effects,
-        test_every=None,
-        response="auto",
         device=device,
-        devices=1,
-        console=Console(),
     )
+    run_training(request, Console())
 
 
 def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
@@ -145,7 +143,7 @@ def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
     # first.
     optimizer.load_state_dict(optimizer.state_dict() | {"state": saved["optimizer"]["state"]})
     create_run(out, config, described.source, described.facts)
-    save_checkpoint(out / "checkpoints" / "last.pt", model, model.light_solver(), optimizer, saved["step"])
+    save_checkpoint(last_checkpoint(out), model, model.light_solver(), optimizer, saved["step"])
     write_json(out / "timing.json", {"sdf_init": read_json(trunk / "timing.json")["sdf_init"]})
 
 

@@ -30,6 +30,7 @@ from neilfpp_method.fields.mlp import SOFTPLUS_SHARPNESS, Mlp
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
@@ -128,16 +129,14 @@ class PlainHost(VolSdfHost):
     needs it.
     """
 
-    def __init__(self, config: NeilfConfig, radiance_scale: float, background: str) -> None:
-        super().__init__(config, radiance_scale, background)
+    def __init__(self, config: NeilfConfig, facts: SceneFacts) -> None:
+        super().__init__(config, facts)
         self.sdf_field = PlainSdf(self.sdf_field)
 
     @torch.no_grad()
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
         beta = self.density.beta().reshape(1, 1)
-        partition = first_cuts(
-            self.sdf, rays, interval.near, interval.far, volume.initial_samples, self.training
-        )
+        partition = first_cuts(self.sdf, rays, interval, volume.initial_samples, self.training)
         worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
         wide = torch.maximum(worst, beta)
         for number in range(volume.rounds + 1):
@@ -159,7 +158,7 @@ def straightforward(model: NeilfModel) -> NeilfModel:
         volume=replace(model.config.volume, skip_empty=False),
         shading=replace(model.config.shading, sampler="fibonacci"),
     )
-    host = PlainHost(config, model.facts.radiance_scale, model.facts.background)
+    host = PlainHost(config, model.facts)
     plain = NeilfModel(host, config, model.facts)
     plain.load_state_dict({k: v for k, v in model.state_dict().items() if "empty_space" not in k})
     plain.brdf, plain.light = PlainBrdf(plain.brdf), PlainLight(plain.light)

@@ -31,7 +31,7 @@ from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.adapt import adapt, check_parameter_groups
 from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, TracesLight
-from neilfpp_method.hosts.batches import check_batch, check_like, check_points, pixel_batch
+from neilfpp_method.hosts.batches import check_batch, check_like, check_points, check_step, pixel_batch
 from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.first_batches import FirstBatches
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
@@ -112,6 +112,7 @@ class AttachedNeilf(nn.Module):
             UserError: the batch or the output of the host is invalid, or on another device.
         """
         check_batch(batch)
+        check_step(step)
         self._check_device_and_dtype("rays", batch.origins)
         self.first_batches.pixels(batch)
         position = self._position(step)
@@ -194,7 +195,7 @@ class AttachedNeilf(nn.Module):
         return self.model.parameter_groups()
 
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
-        """Base color, roughness and metallic at points of the scene frame."""
+        """Base colour, roughness and metallic at points of the scene frame."""
         check_points("x", x)
         self._check_device_and_dtype("x", x)
         return self.model.materials(x)
@@ -238,17 +239,10 @@ class AttachedNeilf(nn.Module):
             self.health()
 
     def _position(self, step: int | Stage | str) -> StagePosition:
-        if not isinstance(step, str):
-            if step < 0:
-                raise UserError(f"step {step}", "count steps from 0")
-            return stage_at(int(step), self.model.config.train)
-        names = [stage.value for stage in Stage]
-        if step not in names:
-            raise UserError(
-                f"unknown stage '{step}'", f"give the index of the step, or one of {', '.join(names)}"
-            )
-        # The position of a stage by name is unknown: step 0 of 2 never is the last step of the stage.
-        return StagePosition(Stage(step), 0, 2)
+        if isinstance(step, str):
+            # The position of a stage by name is unknown: step 0 of 2 never is the last step of the stage.
+            return StagePosition(Stage(step), 0, 2)
+        return stage_at(int(step), self.model.config.train)
 
     def _check_device_and_dtype(self, name: str, value: Tensor) -> None:
         check_like(name, value, next(self.model.brdf.parameters()))

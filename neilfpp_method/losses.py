@@ -30,7 +30,7 @@ __all__ = [
 def photometric(
     radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0
 ) -> LossTerm:
-    """L_vol and L_phys: L1 distance between a rendered color and the pixel.
+    """L_vol and L_phys: L1 distance between a rendered colour and the pixel.
 
     Args:
         radiance: rendered linear radiance.

@@ -150,7 +150,7 @@ class NeilfModel(nn.Module):
         if reuses_points:
             batch, hits = self._rays_to_render(batch, hits)
 
-        # 1. Geometry G and outgoing radiance R: render color, hit position and normal of each camera ray.
+        # 1. Geometry G and outgoing radiance R: render colour, hit position and normal of each camera ray.
         hits, terms = self._render_host(batch, plan, active, hits)
         if "volume" in active:
             terms |= self._volume_losses(batch, hits)
@@ -211,7 +211,7 @@ class NeilfModel(nn.Module):
         return hits, terms
 
     def _volume_losses(self, batch: PixelBatch, hits: SurfaceHits) -> dict[str, LossTerm]:
-        """L_vol of the host's color and, if photographs have gains of their own, the prior on the gains."""
+        """L_vol of the host's colour and, if photographs have gains of their own, the prior on the gains."""
         terms, color = {}, hits.color
         if self.gains is not None:
             terms["exposure"] = losses.exposure(self.gains.drift())
@@ -308,7 +308,7 @@ class NeilfModel(nn.Module):
         return make_light_solver(self.config.light, self.facts, self.units, light, self.lobe)
 
     def materials(self, x: Float[Tensor, "N 3"]) -> Material:
-        """Base color, roughness and metallic at points of the scene frame."""
+        """Base colour, roughness and metallic at points of the scene frame."""
         return self.brdf(x)
 
     def shading_normals(
@@ -343,7 +343,7 @@ class NeilfModel(nn.Module):
 
         Args:
             rays: rays in the scene frame.
-            with_material: if False, neither BRDF nor light is evaluated, and `rgb` is the host's color.
+            with_material: if False, neither BRDF nor light is evaluated, and `rgb` is the host's colour.
             hits: what the host rendered for these rays; if None, the host is rendered here.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()

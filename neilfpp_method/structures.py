@@ -88,7 +88,7 @@ class PixelBatch(Indexable):
             (sRGB) for an LDR capture.
         mask: 1 on the object, 0 off it. Meaningful only where `mask_known` is 1.
         mask_known: 1 everywhere if the capture has masks. Without masks it is 1 only at pixels that show
-            exactly the background color; all other pixels have `mask` 1.
+            exactly the background colour; all other pixels have `mask` 1.
         image_gradient: length of the gradient of the image's luminance by Scharr's filter without
             normalisation, that is 32 times the change per pixel; 0 if no loss needs it.
         view: index of the training view.
@@ -318,11 +318,11 @@ class StepResult(NamedTuple):
 
 @dataclass(frozen=True)
 class Maps:
-    """All maps of an image, one row per ray; colors are linear RGB.
+    """All maps of an image, one row per ray; colours are linear RGB.
 
     Attributes:
-        rgb: color by the rendering equation; equal to `rgb_volume` for a ray without a surface.
-        rgb_volume: color that the host renders.
+        rgb: colour by the rendering equation; equal to `rgb_volume` for a ray without a surface.
+        rgb_volume: colour that the host renders.
         diffuse, specular: the two parts of the shaded radiance; 0 without a surface.
         base_color, roughness, metallic: the material, each in [0, 1]; 0 without a surface.
         normal: unit normal in the scene frame, as used for shading; the host's blended normal without a
@@ -344,7 +344,7 @@ class Maps:
 
     @staticmethod
     def of_host(rays: RayBatch, hits: SurfaceHits) -> Maps:
-        """Maps from the host's output only: `rgb` is its color, and there is no material."""
+        """Maps from the host's output only: `rgb` is its colour, and there is no material."""
         color, parameter = torch.zeros_like(hits.color), torch.zeros_like(hits.color[:, :1])
         depth = ((hits.position - rays.origins) * rays.directions).sum(-1, keepdim=True)
         return Maps(

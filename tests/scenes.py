@@ -44,7 +44,7 @@ def sphere_model(
     torch.manual_seed(0)
     config = config or tiny_config()
     facts = SceneFacts(response, 0.2, 1.0 if response == "srgb" else 3.0, background)
-    return NeilfModel(VolSdfHost(config, facts.radiance_scale, background), config, facts)
+    return NeilfModel(VolSdfHost(config, facts), config, facts)
 
 
 def sphere_batch(count: int = 48, spread: float = 0.8, color: float = 0.3) -> PixelBatch:
@@ -70,3 +70,14 @@ def meet_ball(rays: RayBatch, radius: float) -> tuple[torch.Tensor, torch.Tensor
     square = along.square() - rays.origins.square().sum(-1) + radius**2
     position = rays.origins + (along - square.clamp_min(0).sqrt())[:, None] * rays.directions
     return position, ((square > 0) & (along > 0)).float()
+
+
+def sphere_distance(x: torch.Tensor) -> torch.Tensor:
+    """Signed distance to the sphere of radius 0.6 around the origin."""
+    return x.norm(dim=-1) - 0.6
+
+
+def positions(count: int = 8) -> torch.Tensor:
+    """Random points of the cube [−1, 1]³ in float64, always the same."""
+    generator = torch.Generator().manual_seed(1)
+    return torch.empty(count, 3, dtype=torch.float64).uniform_(-1, 1, generator=generator)

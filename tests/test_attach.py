@@ -19,6 +19,7 @@ from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import PixelBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
@@ -143,7 +144,7 @@ def test_a_preset_can_be_named():
 def test_a_host_with_parameter_groups_is_trained_with_the_material():
     config = tiny_config()
     torch.manual_seed(0)
-    host = VolSdfHost(config, 3.0, "constant")
+    host = VolSdfHost(config, SceneFacts("linear", 0.2, 3.0, "constant"))
     neilf = attach_neilf(host, config)
     assert set(neilf.parameter_groups()) == {"geometry", "beta", "radiance", "brdf", "light"}
     assert {id(p) for p in host.parameters()} < {id(p) for p in neilf.parameters()}
@@ -251,7 +252,7 @@ def test_missing_capabilities_are_logged_once_in_one_line(caplog):
     assert missing_capabilities(sphere_model().host) == {}
 
 
-def test_a_nerfstudio_model_is_recognised_by_its_attributes(monkeypatch):
+def test_a_nerfstudio_model_is_recognized_by_its_attributes(monkeypatch):
     class Adapter(BallHost):
         def __init__(self, model, response):
             super().__init__()
@@ -328,7 +329,7 @@ def test_a_function_may_return_a_dictionary():
         incomplete.losses(pixels(), Stage.MATERIAL_INIT)
 
 
-def test_a_colour_without_gradient_is_accepted_if_it_is_not_trained():
+def test_a_color_without_gradient_is_accepted_if_it_is_not_trained():
     neilf = attach_neilf(spoiled(lambda c, p, n: (c.detach(), p, n)), tiny_config())
     assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()
 

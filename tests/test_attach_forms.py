@@ -12,7 +12,7 @@ import torch
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.batches import check_batch, check_points, check_rows
+from neilfpp_method.hosts.batches import check_batch, check_points, check_rows, check_step
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
@@ -163,6 +163,9 @@ def test_arrays_and_tuples_are_named():
         check_rows("origins", rays.origins.numpy(), 4, 3)
     with pytest.raises(UserError, match=r"the batch is a tuple; make one with attach.pixel_batch"):
         check_batch((rays.origins, rays.directions))
+    for step in (None, float("nan"), [3]):
+        with pytest.raises(UserError, match=r"the step is .*; give the index of the step"):
+            check_step(step)
     with pytest.raises(UserError, match=r"x is a list; give a tensor"):
         check_points("x", [[0.0, 0.0, 1.0]])
     with pytest.raises(

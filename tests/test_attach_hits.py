@@ -282,7 +282,8 @@ def test_impossible_facts_are_refused_by_name(arguments, message):
 def test_a_stage_is_one_of_three():
     neilf = attach_neilf(Ball(), tiny_config())
     with pytest.raises(
-        UserError, match="unknown stage 'late'; give the index of the step, or one of sdf_init, material_init"
+        UserError,
+        match="unknown stage 'late'; give the index of the step, or one of sdf_init, material_init",
     ):
         neilf.losses(pixels(ball_rays(4)), "late")
     with pytest.raises(UserError, match="step -1; count steps from 0"):

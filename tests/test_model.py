@@ -116,7 +116,7 @@ def test_the_first_render_matches_the_median_of_the_images():
     assert maps.rgb.mean().item() == pytest.approx(model.facts.median_radiance, rel=0.15)
 
 
-def test_pbr_colour_of_a_white_furnace():
+def test_pbr_color_of_a_white_furnace():
     """Under light of 1 from all directions the colour of a Lambertian surface is its base colour, with any
     host.
     """
@@ -189,15 +189,15 @@ def test_no_ray_starts_further_out_than_the_published_bound():
     assert len(traced.wi) == pytest.approx(500 * (1 - steepest) / (1 - math.cos(math.radians(80))), rel=0.15)
 
 
-def test_a_light_without_colour_is_compared_by_luminance():
+def test_a_light_without_color_is_compared_by_luminance():
     """Red, green and blue radiance of equal luminance agree with a grey light of that luminance."""
     config = tiny_config()
     model = sphere_model(
         dataclasses.replace(config, light=dataclasses.replace(config.light, monochrome=True))
     )
-    grey, colors = torch.full((3, 3), 0.05), torch.diag(0.05 / torch.tensor([0.2126, 0.7152, 0.0722]))
-    assert losses.inter_reflection(grey, colors, monochrome=True).mean() < 1e-6
-    assert losses.inter_reflection(grey, colors).mean() > 0.05
+    gray, colors = torch.full((3, 3), 0.05), torch.diag(0.05 / torch.tensor([0.2126, 0.7152, 0.0722]))
+    assert losses.inter_reflection(gray, colors, monochrome=True).mean() < 1e-6
+    assert losses.inter_reflection(gray, colors).mean() > 0.05
     model.light.radiance = lambda x, wi: torch.full((*wi.shape[:2], 3), 0.05)
     model.host.render = lambda rays: SurfaceHits(
         colors[:1].expand(len(rays), 3), rays.origins, rays.directions, *torch.ones(2, len(rays))

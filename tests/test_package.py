@@ -32,7 +32,7 @@ def test_type_checkers_may_read_the_annotations():
     assert (Path(neilfpp_method.__file__).parent / "py.typed").is_file()
 
 
-def test_licence_and_citation_name_the_same_version():
+def test_license_and_citation_name_the_same_version():
     assert (ROOT / "LICENSE").read_text().startswith("MIT License")
     assert f"version: {neilfpp_method.__version__}\n" in (ROOT / "CITATION.cff").read_text()
     assert f'version = "{neilfpp_method.__version__}"\n' in (ROOT / "pyproject.toml").read_text()

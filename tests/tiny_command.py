@@ -2,7 +2,7 @@
 train …`.
 
 With TINY_RECORD=FOLDER every process also writes what it computed: `gradients_RANK.pt` of the first step, as
-the optimiser sees them, and `parameters_RANK.pt` at the end.
+the optimizer sees them, and `parameters_RANK.pt` at the end.
 """
 
 from __future__ import annotations

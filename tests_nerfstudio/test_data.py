@@ -29,7 +29,7 @@ from neilfpp_method.train.optimizer import seed_step
 from tests.data.formats.scenes import POINTS, material
 from tests.data.formats.test_colmap import colmap_camera, reconstruction
 from tests.data.formats.test_colmap import write as write_model
-from tests.data.make_capture import CENTRE, SCALE, make_capture
+from tests.data.make_capture import CENTER, SCALE, make_capture
 
 VIEWS, WIDTH, HEIGHT = 6, 24, 18
 
@@ -63,7 +63,7 @@ def test_the_transform_maps_the_world_to_the_scene(root: Path) -> None:
     point = np.array([1.0, 2.0, 3.0])
     transform = outputs.dataparser_transform.double().numpy()
     moved = outputs.dataparser_scale * (transform[:, :3] @ point + transform[:, 3])
-    np.testing.assert_allclose(moved, (point - CENTRE) / SCALE, atol=1e-6)
+    np.testing.assert_allclose(moved, (point - CENTER) / SCALE, atol=1e-6)
 
 
 def test_each_drawn_pixel_has_its_color_and_loss_inputs(root: Path) -> None:
@@ -229,7 +229,7 @@ def test_a_colmap_model_converted_by_nerfstudio_is_read(tmp_path: Path, model: s
         )
     assert theirs.scene_from == "points"  # from sparse_pc.ply, in the rotated frame
     np.testing.assert_allclose(
-        theirs.normalisation.centre, applied[:, :3] @ first.normalisation.centre, atol=0.1
+        theirs.normalisation.center, applied[:, :3] @ first.normalisation.center, atol=0.1
     )
 
 

@@ -37,29 +37,29 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plugin_model, "CHECKED_PIXELS", 16)
 
 
-CENTRE, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5
+CENTER, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5
 DRAWN = 0.5
 
 
 class Ball(Model):
-    """A ball around CENTRE with normals and a single grey value; a ray that misses it has no weight."""
+    """A ball around CENTER with normals and a single grey value; a ray that misses it has no weight."""
 
     def populate_modules(self) -> None:
-        self.grey = nn.Parameter(torch.tensor(DRAWN))
+        self.gray = nn.Parameter(torch.tensor(DRAWN))
         self.fixed = nn.Parameter(torch.zeros(1), requires_grad=False)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {"fields": [self.grey, self.fixed]}
+        return {"fields": [self.gray, self.fixed]}
 
     def get_outputs(self, ray_bundle: RayBundle) -> dict[str, torch.Tensor]:
-        start = ray_bundle.origins - CENTRE
+        start = ray_bundle.origins - CENTER
         b = (start * ray_bundle.directions).sum(-1, keepdim=True)
         root = b**2 - start.square().sum(-1, keepdim=True) + RADIUS**2
         hit = (root > 0).float()
         distance = -b - root.clamp_min(0).sqrt()
         normal = hit * (start + distance * ray_bundle.directions) / RADIUS
         return {
-            "rgb": self.grey.expand_as(normal),
+            "rgb": self.gray.expand_as(normal),
             "accumulation": hit,
             "depth": distance / ray_bundle.metadata["directions_norm"],
             "normal": 0.3 * normal,
@@ -92,7 +92,7 @@ def rays() -> RayBatch:
 @pytest.mark.parametrize("kind", [Ball, ColorCodedBall])
 def test_hits_are_in_the_scene_frame(kind: type[Model]) -> None:
     # In the scene frame the ball is the sphere of radius RADIUS / 3 about the origin.
-    host = NerfstudioHost(ball(kind), frame=Normalisation(3.0, tuple(CENTRE.tolist())))
+    host = NerfstudioHost(ball(kind), frame=Normalisation(3.0, tuple(CENTER.tolist())))
     hits = host.render(rays())
     hit = slice(0, 3)
     torch.testing.assert_close(hits.position[hit].norm(dim=-1), torch.full((3,), RADIUS / 3.0))
@@ -116,8 +116,8 @@ def test_rendered_colors_become_linear_radiance() -> None:
 def test_gradients_reach_only_the_trained_parameters() -> None:
     host = NerfstudioHost(ball())
     host.render(rays()).color.sum().backward()
-    assert host.model.grey.grad.abs() > 0
-    assert host.parameter_groups()["geometry"] == [host.model.grey]
+    assert host.model.gray.grad.abs() > 0
+    assert host.parameter_groups()["geometry"] == [host.model.gray]
 
 
 @pytest.mark.parametrize(

@@ -240,8 +240,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "rows of the map counted from below",
         "fields/direction_map.py",
-        "((torch.arange(height + 1) - 0.5)",
-        "((height - torch.arange(height + 1) - 0.5)",
+        "((edge - 0.5).clamp(0, height - 1)",
+        "((height - edge - 0.5).clamp(0, height - 1)",
         "fields/test_environment.py",
     ),
     Mutant(
@@ -297,7 +297,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "scene frame is not centred",
         "data/views.py",
-        "(points - points.new_tensor(self.centre)) / self.scale",
+        "(points - points.new_tensor(self.center)) / self.scale",
         "points / self.scale",
         "data/test_capture.py",
     ),
@@ -359,7 +359,7 @@ MUTANTS: Sequence[Mutant] = (
         "train/test_checkpoint.py",
     ),
     Mutant(
-        "the optimiser starts anew on resume",
+        "the optimizer starts anew on resume",
         "train/loop.py",
         '    optimizer.load_state_dict(saved["optimizer"])\n',
         "",

@@ -90,19 +90,20 @@ def run(options: TrainWithSettings) -> None:
     from neilfpp_method.effects.request import parse_effects
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.command import run_training
+    from neilfpp_method.train.request import TrainingRequest
 
     budget = None if options.budget is None else read_duration(options.budget)
     config = _with_files(options)
     named = options.preset is not None or options.config_file is not None
     as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
     published = config.preset.startswith("paper-")
-    request = (
+    effects = (
         None
         if options.resume and options.effects is None
         else parse_effects(options.effects or ("as-set" if published else "auto"))
     )
     with computing_fast(), _viewer(options, config):
-        run_training(
+        request = TrainingRequest(
             data=options.data,
             out=options.out,
             config=None if as_before else config,
@@ -115,11 +116,11 @@ def run(options: TrainWithSettings) -> None:
             devices=options.devices,
             nodes=options.nodes,
             strict=options.strict,
-            effects=request,
+            effects=effects,
             budget=budget,
-            console=terminal(),
-            at_end=(lambda path: after_training(path, options.device)) if options.report else None,
         )
+        write_report = (lambda path: after_training(path, options.device)) if options.report else None
+        run_training(request, terminal(), write_report)
 
 
 def _viewer(options: TrainWithSettings, config: NeilfConfig) -> AbstractContextManager[object]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.files import Files, read_files
-from neilfpp_method.train.run import CaptureSource, load_checkpoint, read_description
+from neilfpp_method.train.run import CaptureSource, last_checkpoint, load_checkpoint, read_description
 
 __all__ = ["Contender", "labels_of", "read_contenders"]
 
@@ -65,7 +65,7 @@ def read_contenders(paths: Sequence[Path]) -> list[Contender]:
 
 
 def _last_step(path: Path) -> int:
-    last = path / "checkpoints" / "last.pt"
+    last = last_checkpoint(path)
     return int(load_checkpoint(last)["step"]) if last.is_file() else 0
 
 

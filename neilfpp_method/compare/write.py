@@ -24,8 +24,9 @@ from neilfpp_method.compare.sheet import Column, comparison_sheet
 from neilfpp_method.data.images import replacing, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.views import ComparedViews, compare_views
+from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_writable
-from neilfpp_method.train.run import load_run, write_json
+from neilfpp_method.train.run import load_run
 
 __all__ = ["FILES", "Comparison", "compare_runs"]
 

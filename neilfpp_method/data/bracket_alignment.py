@@ -163,7 +163,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
     slopes = np.stack(
         [dx * x, dx * y, dx, dy * x, dy * y, dy, -along * x, -along * y, pair.fixed, np.ones_like(x)]
     )
-    centred = pair.scale @ np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]])
+    centered = pair.scale @ np.array([[unit, 0, (width - 1) / 2], [0, unit, (height - 1) / 2], [0, 0, 1]])
     for _ in range(ROUNDS):
         warped, usable = pair.warped(motion)
         if usable.mean() < MIN_OVERLAP:
@@ -174,7 +174,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
         weighted = usable_slopes / np.maximum(np.abs(difference - np.median(difference)) / typical, 1.0)
         step = np.linalg.lstsq(weighted @ usable_slopes.T, weighted @ difference, rcond=1e-9)[0]
         small = np.eye(3) + np.append(step[:8], 0).reshape(3, 3)
-        change = centred @ np.linalg.inv(small) @ np.linalg.inv(centred)
+        change = centered @ np.linalg.inv(small) @ np.linalg.inv(centered)
         motion = motion @ change
         motion = motion / motion[2, 2]
         if _corner_shift(change, (height, width)) < CONVERGED:

@@ -50,7 +50,7 @@ class Reader(Protocol):
 
     LAYOUT: str
 
-    def recognise(self, root: Path) -> bool:
+    def recognize(self, root: Path) -> bool:
         """Return whether the folder has this layout, without reading large files."""
 
     def read(self, root: Path) -> CaptureFiles:
@@ -111,7 +111,7 @@ class Capture:
         sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
         size = f"{sizes[0][0]}×{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
         masks = sum(view.mask is not None for view in self.views)
-        x, y, z = self.normalisation.centre
+        x, y, z = self.normalisation.center
         return "\n".join(
             [
                 f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
@@ -150,10 +150,10 @@ def load_capture(
     if not root.is_dir():
         problem = "a file, not a folder" if root.exists() else "no such folder"
         raise UserError(f"{root}: {problem}", "give the folder of a capture")
-    format = format or _recognise(root)
+    format = format or _recognize(root)
     if format not in READERS:
         raise UserError(f"unknown capture format '{format}'", f"choose one of {', '.join(READERS)}")
-    if not READERS[format].recognise(root):
+    if not READERS[format].recognize(root):
         raise UserError(f"{root}: not a capture of the format {format}", f"it needs {READERS[format].LAYOUT}")
     files = READERS[format].read(root)
     floating = _check_views(files.views)
@@ -176,9 +176,9 @@ def _of(count: int, views: int) -> str:
     return f"{count} of {views}" if 0 < count < views else str(count or "none")
 
 
-def _recognise(root: Path) -> str:
+def _recognize(root: Path) -> str:
     for name, reader in READERS.items():
-        if reader.recognise(root):
+        if reader.recognize(root):
             return name
     if (root / "config.json").is_file() and (root / "capture.json").is_file():
         raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")

@@ -16,7 +16,7 @@ from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["FILE", "LAYOUT", "Writable", "read", "read_scene", "recognise", "write_capture"]
+__all__ = ["FILE", "LAYOUT", "Writable", "read", "read_scene", "recognize", "write_capture"]
 
 LAYOUT = "a capture.json that names its format"
 FILE = "capture.json"
@@ -24,7 +24,7 @@ FORMAT = "neilfpp-capture"
 VERSION = 1
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Return whether the folder has a `capture.json` of this format; in run folders it has another format."""
     path = root / FILE
     return path.is_file() and FORMAT.encode() in path.read_bytes()
@@ -61,7 +61,7 @@ def read(root: Path) -> CaptureFiles:
 
 
 def read_scene(entry: Entry) -> Normalisation:
-    """Read the scene box from an entry with `centre` and `radius`.
+    """Read the scene box from an entry with `center` and `radius`.
 
     Raises:
         UserError: they are not numbers, or the radius is not positive.
@@ -166,7 +166,7 @@ def write_capture(
         "version": VERSION,
         "response": response,
         "scene": {
-            "centre": list(files.normalisation.centre),
+            "centre": list(files.normalisation.center),
             "radius": files.normalisation.scale,
             "source": files.scene_from,
         },

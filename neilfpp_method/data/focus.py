@@ -47,7 +47,7 @@ class Axes:
 class Focus:
     """A point in the world frame, the cameras that look at it, and their median distance from it."""
 
-    centre: Float64[np.ndarray, " 3"]
+    center: Float64[np.ndarray, " 3"]
     looking: Bool[np.ndarray, " V"]
     distance: float
 
@@ -70,24 +70,24 @@ def find_focus(views: Sequence[View]) -> Focus | None:
 
     Example:
         >>> focus = find_focus(capture.views)
-        >>> focus and focus.centre, focus and focus.distance
+        >>> focus and focus.center, focus and focus.distance
     """
     axes = axes_of(views)
     weights = np.ones(len(views))
     for _ in range(ITERATIONS):
-        centre = meeting_point(axes, weights)
-        if centre is None:
+        center = meeting_point(axes, weights)
+        if center is None:
             return None
-        to = centre - axes.eyes
+        to = center - axes.eyes
         beside = np.linalg.norm(np.einsum("vij,vj->vi", axes.across, to), axis=1)
         weights = 1.0 / np.maximum(beside, MIN_DISTANCE * np.median(np.linalg.norm(to, axis=1)) + 1e-12)
-    looking = np.array([_looks_at(view, centre) for view in views])
+    looking = np.array([_looks_at(view, center) for view in views])
     if looking.mean() < MIN_SHARE:
         return None
     spread = np.linalg.eigvalsh(axes.across[looking].mean(axis=0))[0]
     if spread < np.sin(np.radians(MIN_SPREAD_DEG)) ** 2:
         return None
-    return Focus(centre, looking, float(np.median(np.linalg.norm(to[looking], axis=1))))
+    return Focus(center, looking, float(np.median(np.linalg.norm(to[looking], axis=1))))
 
 
 def meeting_point(axes: Axes, weights: Float64[np.ndarray, " V"]) -> Float64[np.ndarray, " 3"] | None:

@@ -67,14 +67,14 @@ class Lens:
     def camera(
         self,
         focal: tuple[float, float] = (1.0, 1.0),
-        centre: tuple[float, float] = (0.0, 0.0),
+        center: tuple[float, float] = (0.0, 0.0),
         size: tuple[int, int] = (1, 1),
     ) -> pycolmap.Camera:
         """Return a camera of pycolmap with this lens; for a model with one focal length, it is the mean."""
         camera = pycolmap.Camera.create_from_model_name(0, self.model, 1.0, *size)
         params, focals = np.zeros(len(camera.params)), list(camera.focal_length_idxs())
         params[focals] = focal if len(focals) == 2 else np.mean(focal)
-        params[list(camera.principal_point_idxs())] = centre
+        params[list(camera.principal_point_idxs())] = center
         params[list(camera.extra_params_idxs())] = self.coefficients
         camera.params = params
         return camera

@@ -34,10 +34,10 @@ BORDER_SHARE = 0.5
 DARK = 1e-3
 """Luminance below which a pixel counts as black, relative to the mean of the object."""
 
-MIDDLE_GREY = 0.18
+MIDDLE_GRAY = 0.18
 """Linear value to which the median of the object is brought for image gradients: photographic middle grey."""
 
-NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
+NEIGHBORS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
 """Offsets (row, column) of the 3 × 3 neighbourhood of a pixel."""
 MAX_COUNTED = 2**20
 """Largest number of object pixels, evenly drawn from all views, from which statistics are computed."""
@@ -183,7 +183,7 @@ class PixelDataset:
     def _exposure(self) -> float:
         """Factor that brings the median of the object to middle grey; 1 if pixels are display values."""
         positive = self._positive_luminance() if self.capture.hdr else ()
-        return MIDDLE_GREY / float(positive.median()) if len(positive) else 1.0
+        return MIDDLE_GRAY / float(positive.median()) if len(positive) else 1.0
 
     def _display_luminance(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float32[Tensor, "*shape"]:
         """Display luminance; linear images are exposed so that the median of the object is middle grey."""
@@ -197,8 +197,8 @@ class PixelDataset:
         size = np.array([(view.camera.width, view.camera.height) for view in self.views])[views]
         at = numbers - self.store.starts[views]
         column, row, last = at % size[:, 0], at // size[:, 0], size - 1
-        columns = np.clip(column + NEIGHBOURS[:, 1, None], 0, last[:, 0])
-        rows = np.clip(row + NEIGHBOURS[:, 0, None], 0, last[:, 1])
+        columns = np.clip(column + NEIGHBORS[:, 1, None], 0, last[:, 0])
+        rows = np.clip(row + NEIGHBORS[:, 0, None], 0, last[:, 1])
         around = self.store.starts[views] + rows * size[:, 0] + columns
         colors = self.store.colors(around, np.broadcast_to(views, around.shape))
         return _scharr(self._display_luminance(colors).unbind(0))
@@ -303,12 +303,12 @@ def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
     padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     height, width = values.shape
     return _scharr(
-        [padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] for row, column in NEIGHBOURS]
+        [padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] for row, column in NEIGHBORS]
     )
 
 
 def _scharr(about: Sequence[Float32[Tensor, "*shape"]]) -> Float32[Tensor, "*shape"]:
-    """The length of the Scharr gradient from the nine values around each pixel, in the order of `NEIGHBOURS`.
+    """The length of the Scharr gradient from the nine values around each pixel, in the order of `NEIGHBORS`.
 
     The usual factor of 1/32 is left out, so a ramp of 0.01 per pixel has the value 0.32. The weight of L_smth
     is the exponential of this value, as in the published code; with the factor, no edge of an image would

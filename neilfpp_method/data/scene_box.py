@@ -97,7 +97,7 @@ def box_of_focus(views: Sequence[View]) -> Normalisation | None:
     focus = find_focus(views)
     if focus is None:
         return None
-    x, y, z = map(float, focus.centre)
+    x, y, z = map(float, focus.center)
     return Normalisation(REACH * focus.distance, (x, y, z))
 
 
@@ -111,13 +111,13 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     """
     where = views[0].image.parent
     axes, focus = axes_of(views), find_focus(views)
-    centre = meeting_point(axes, np.ones(len(views))) if focus is None else focus.centre
-    if centre is None:
+    center = meeting_point(axes, np.ones(len(views))) if focus is None else focus.center
+    if center is None:
         raise UserError(
             f"{where}: the cameras look in one direction, so the position of the scene is unknown",
             "add points or a scene box",
         )
-    depth = np.einsum("ni,ni->n", centre - axes.eyes, axes.ahead)
+    depth = np.einsum("ni,ni->n", center - axes.eyes, axes.ahead)
     if np.median(depth) <= 0:
         raise UserError(
             f"{where}: the cameras look away from one another, so the position of the scene is unknown",
@@ -125,7 +125,7 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
         )
     half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in (view.camera for view in views)]
     radius = float(np.median(depth * half)) * fill
-    return Normalisation(radius, (float(centre[0]), float(centre[1]), float(centre[2])))
+    return Normalisation(radius, (float(center[0]), float(center[1]), float(center[2])))
 
 
 def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Normalisation:
@@ -141,8 +141,8 @@ def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Nor
 
 def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
     """The box of the visual hull: of the points in nearly all silhouettes, on successively finer grids."""
-    centre, half = np.array(start.centre), np.full(3, start.scale)
-    low, high = centre - half, centre + half
+    center, half = np.array(start.center), np.full(3, start.scale)
+    low, high = center - half, center + half
     for _ in range(REFINEMENTS):
         axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
         cell = (high - low) / (CELLS - 1)

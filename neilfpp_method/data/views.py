@@ -145,20 +145,20 @@ class Normalisation:
     """scene = (world − centre) / scale: without rotation, directions are the same in both frames."""
 
     scale: float
-    centre: tuple[float, float, float]
+    center: tuple[float, float, float]
 
     def to_scene(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Transform positions from the world frame to the scene frame."""
-        return (points - points.new_tensor(self.centre)) / self.scale
+        return (points - points.new_tensor(self.center)) / self.scale
 
     def to_world(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Transform positions from the scene frame to the world frame."""
-        return points * self.scale + points.new_tensor(self.centre)
+        return points * self.scale + points.new_tensor(self.center)
 
     def camera(self, camera: Camera) -> Camera:
         """Return the camera in the scene frame: with the same image, and depths divided by `scale`."""
         w2c = camera.w2c.copy()
-        w2c[:3, 3] = (w2c[:3, :3] @ np.array(self.centre) + w2c[:3, 3]) / self.scale
+        w2c[:3, 3] = (w2c[:3, :3] @ np.array(self.center) + w2c[:3, 3]) / self.scale
         return replace(camera, w2c=w2c)
 
 
@@ -353,5 +353,5 @@ def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]
 
 def _straight_plane(camera: Camera, pixel: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
     """Points of the plane at depth 1 that rays of a camera with a lens meet; NaN if a pixel has no ray."""
-    centres = np.stack([pixel % camera.width, pixel // camera.width], axis=1) + 0.5
-    return camera.lens.straighten((centres - camera.intrinsics[2:]) / camera.intrinsics[:2])
+    centers = np.stack([pixel % camera.width, pixel // camera.width], axis=1) + 0.5
+    return camera.lens.straighten((centers - camera.intrinsics[2:]) / camera.intrinsics[:2])

@@ -104,8 +104,8 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
         radius: half an edge of the cube.
         resolution: number of cells along an edge, R.
     """
-    centre = (np.arange(resolution) + 0.5) * (2 * radius / resolution) - radius
-    points = np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), axis=-1).reshape(-1, 3)
+    center = (np.arange(resolution) + 0.5) * (2 * radius / resolution) - radius
+    points = np.stack(np.meshgrid(center, center, center, indexing="ij"), axis=-1).reshape(-1, 3)
     candidates = np.arange(len(points))
     seen_by, excluded_by = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     # Small silhouettes exclude the most points, so fewer points remain for the following views.

@@ -17,6 +17,7 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import load_run
 
 __all__ = ["demo_config", "demo_scene", "run_demo"]
@@ -47,19 +48,16 @@ def run_demo(out: Path, *, short: bool, resume: bool, device: str, console: Cons
     Returns:
         The path of the report.
     """
-    run_training(
+    request = TrainingRequest(
         data=demo_scene(),
         out=out,
         config=None if resume else demo_config(short),
         resume=resume,
-        test_every=None,
-        response="auto",
-        device=device,
-        devices=1,
-        console=console,
         effects=None if resume else parse_effects("auto"),
+        device=device,
         command="neilfpp demo",
     )
+    run_training(request, console)
     run = load_run(out, pick_device(device))
     console.print("evaluating the test views …")
     rendered = render_test_views(run)

@@ -64,7 +64,7 @@ POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
 """Batch sizes, which bound the memory: points that are shaded together, and points whose views are searched
 together.
 """
-NEIGHBOURS, NEAR, TURN = 9, 0.1, 0.1
+NEIGHBORS, NEAR, TURN = 9, 0.1, 0.1
 """Neighbourhood of a point in `_smoothed`: its largest size, the point included; its radius, scene units; and
 the distance, scene units, that one radian between two normals adds.
 """
@@ -128,7 +128,7 @@ def gather_evidence(run: Run) -> Evidence:
         parts = by_patch(incident.light, incident.patch, patch_count(model))
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
-        return Evidence(views, 1.0, 1.0, views.centres.new_zeros(3, patch_count(model)))
+        return Evidence(views, 1.0, 1.0, views.centers.new_zeros(3, patch_count(model)))
     noise, misfit = (max(torch.cat(values).median().item(), MIN_NOISE) for values in (errors, misfits))
     return Evidence(views, noise, misfit, torch.cat(shares).mean(0))
 
@@ -220,7 +220,7 @@ def _smoothed(
     """
     coordinates = torch.cat((position, TURN * normal), -1).cpu().numpy()
     tree = cKDTree(coordinates)
-    nearest = tree.query(coordinates, k=range(1, 1 + NEIGHBOURS), distance_upper_bound=NEAR)[1]
+    nearest = tree.query(coordinates, k=range(1, 1 + NEIGHBORS), distance_upper_bound=NEAR)[1]
     # If a point has fewer neighbours, the tree returns the index after the last row; that row is padded
     # with NaN here, which nanmedian ignores.
     values = (

@@ -38,7 +38,7 @@ def _length(title: str, meaning: str) -> Entry:
     return Entry(title, "%.4f", "lower", meaning)
 
 
-def _millimetres(title: str, meaning: str) -> Entry:
+def _millimeters(title: str, meaning: str) -> Entry:
     return Entry(title, "%.3f mm", "lower", meaning)
 
 
@@ -122,9 +122,9 @@ ENTRIES: Mapping[str, Entry] = {
     "depth_mse": Entry(
         "Depth, scaled", "%.4g", "lower", "Mean squared error after one factor for all views."
     ),
-    "chamfer_mm": _millimetres("Surface", "Mean of the two below."),
-    "chamfer_accuracy_mm": _millimetres("Surface, accuracy", "From the estimate to the truth."),
-    "chamfer_completeness_mm": _millimetres("Surface, completeness", "From the truth to the estimate."),
+    "chamfer_mm": _millimeters("Surface", "Mean of the two below."),
+    "chamfer_accuracy_mm": _millimeters("Surface, accuracy", "From the estimate to the truth."),
+    "chamfer_completeness_mm": _millimeters("Surface, completeness", "From the truth to the estimate."),
     "base_color_gamma": Entry(
         "Gamma of base colour",
         "%.3f",

@@ -181,9 +181,9 @@ def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
     ar = (1 - m) * p.dr + m * p.fr - k * ((1 - m) * p.df + m * p.ff)
     rr = p.rr - 2 * k * p.fr + k.square() * p.ff
     precision = aa + PRIOR_PRECISION
-    centre = (ar + 0.5 * PRIOR_PRECISION) / precision
+    center = (ar + 0.5 * PRIOR_PRECISION) / precision
     width = precision.rsqrt()
-    low, high = -centre / width, (1 - centre) / width
+    low, high = -center / width, (1 - center) / width
 
     # Mirror both ends into the lower tail, where log_ndtr keeps its relative precision.
     mirrored = low + high > 0
@@ -199,7 +199,7 @@ def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
         for end in (low, high)
     )
     shift = at_low - at_high
-    mean = (centre + width * shift).clamp(0, 1)
+    mean = (center + width * shift).clamp(0, 1)
     variance = (1 + low * at_low - high * at_high - shift.square()).clamp(0, 1) * width.square()
-    log_evidence = (precision * centre.square() - rr) / 2 + width.log() + log_mass
+    log_evidence = (precision * center.square() - rr) / 2 + width.log() + log_mass
     return _BaseColor(mean, variance.clamp_max(1 / 12), log_evidence)

@@ -40,7 +40,8 @@ from neilfpp_method.evaluate.views import RenderedView, known_test_views, mask_s
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.train.health_record import read_findings
-from neilfpp_method.train.run import Run, write_json
+from neilfpp_method.train.json_files import write_json
+from neilfpp_method.train.run import Run
 
 __all__ = ["evaluate", "protocol", "write_metrics"]
 

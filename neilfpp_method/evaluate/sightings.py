@@ -51,10 +51,10 @@ class TrainingViews:
         self.hdr = capture.hdr
         self.pixels = PixelDataset(capture, capture.train_views, device)
         self.cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-        self.centres = torch.stack(
+        self.centers = torch.stack(
             [torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]
         ).to(device)
-        self.order = _farthest_first(self.centres)
+        self.order = _farthest_first(self.centers)
 
     def evenly_spaced_pixels(self, count: int) -> PixelBatch:
         """Return about `count` pixels of the object, evenly over and within the views. Deterministic."""
@@ -86,12 +86,12 @@ class TrainingViews:
             view = self.pixels.view(i, gradients=False)
             index = pixel_index(project(self.cameras[i], position[rows]), self.cameras[i])
             usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < 1).all(-1))
-            to_camera = self.centres[i] - position[rows]
+            to_camera = self.centers[i] - position[rows]
             distance = to_camera.norm(dim=-1)
             direction = to_camera / distance[:, None]
             kept = (index >= 0) & usable[index] & ((direction * normal[rows]).sum(-1) > MIN_COSINE)
             rows, direction, distance, index = rows[kept], direction[kept], distance[kept], index[kept]
-            unoccluded = _unoccluded(model, self.centres[i], position[rows], direction, distance)
+            unoccluded = _unoccluded(model, self.centers[i], position[rows], direction, distance)
             rows, index = rows[unoccluded], index[unoccluded]
             slot = visible[rows].sum(1)
             visible[rows, slot], wo[rows, slot] = True, direction[unoccluded]
@@ -103,7 +103,7 @@ class TrainingViews:
 
 def _unoccluded(
     model: NeilfModel,
-    centre: Float[Tensor, " 3"],
+    center: Float[Tensor, " 3"],
     position: Float[Tensor, "N 3"],
     direction: Float[Tensor, "N 3"],
     distance: Float[Tensor, " N"],
@@ -117,7 +117,7 @@ def _unoccluded(
         return scene(position, direction[:, None]).distance[:, 0] >= distance - TOLERANCE
     unoccluded = torch.zeros_like(distance, dtype=torch.bool)
     for rows in torch.arange(len(distance), device=distance.device).split(EVAL_RAYS):
-        hits = model.host.render(RayBatch(centre.expand(len(rows), 3), -direction[rows]))
+        hits = model.host.render(RayBatch(center.expand(len(rows), 3), -direction[rows]))
         unoccluded[rows] = hits.is_hit(share) & ((hits.position - position[rows]).norm(dim=-1) <= TOLERANCE)
     return unoccluded
 
@@ -130,12 +130,12 @@ def pixel_index(projected: Projection, camera: Camera) -> Int[Tensor, " N"]:
     return torch.where(inside, row * camera.width + column, -1)
 
 
-def _farthest_first(centres: Float[Tensor, "C 3"]) -> list[int]:
+def _farthest_first(centers: Float[Tensor, "C 3"]) -> list[int]:
     """Order in which each centre is the one farthest from all before it, starting with the first."""
     order = [0]
-    distance = torch.full_like(centres[:, 0], torch.inf)
-    while len(order) < len(centres):
-        distance = torch.minimum(distance, (centres - centres[order[-1]]).norm(dim=-1))
+    distance = torch.full_like(centers[:, 0], torch.inf)
+    while len(order) < len(centers):
+        distance = torch.minimum(distance, (centers - centers[order[-1]]).norm(dim=-1))
         distance[order] = -1.0
         order.append(int(distance.argmax()))
     return order

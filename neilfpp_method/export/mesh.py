@@ -183,12 +183,12 @@ def _sparse_grid(
     corners = _lattice(blocks, device) * (BLOCK * step) - radius
     half_edge = 0.5 * (BLOCK - 1) * step
     half_diagonal = math.sqrt(3.0) * half_edge
-    centres = corners + half_edge
-    coarse = sdf(centres)
+    centers = corners + half_edge
+    coarse = sdf(centers)
     near = coarse.abs() <= SLACK * half_diagonal
     # Blocks beyond the sphere are cut off later. The margin of two steps keeps the grid edges that cross the
     # sphere exact.
-    near &= centres.norm(dim=-1) <= radius + half_diagonal + 2.0 * step
+    near &= centers.norm(dim=-1) <= radius + half_diagonal + 2.0 * step
     values = coarse[:, None].repeat(1, BLOCK**3)
     points = corners[near][:, None] + _lattice(BLOCK, device) * step
     if len(points):

@@ -18,7 +18,7 @@ from neilfpp_method.fields.mlp import Mlp
 from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 from neilfpp_method.volume.compositing import composite, render_weights
 
-__all__ = ["InvertedSphere", "background_field"]
+__all__ = ["InvertedSphere"]
 
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 """Octaves of the frequency encodings of positions and directions (NeRF++)."""
@@ -27,26 +27,14 @@ SHELL_RADIUS = 2.0
 MIN_START = 1e-2
 """Smallest distance of the initial radiance from both ends of the sigmoid's range, relative to the range."""
 START_SCALE = 1e-3
-"""Factor on the initial weights of the last layer, so that the field starts as an almost constant color."""
-
-
-def background_field(
-    kind: str,
-    config: BackgroundConfig,
-    encoding: FrequencyConfig | HashGridConfig,
-    radius: float,
-    scale: float,
-    start: Float[Tensor, " 3"],
-) -> InvertedSphere | None:
-    """Make an `InvertedSphere` if `kind` is "inverted_sphere"; otherwise return None."""
-    return InvertedSphere(config, encoding, radius, scale, start) if kind == "inverted_sphere" else None
+"""Factor on the initial weights of the last layer, so that the field starts as an almost constant colour."""
 
 
 class InvertedSphere(nn.Module):
     """Radiance field outside of the scene sphere in the coordinates (x/r, 1/r), r the distance to the origin.
 
     Density is per unit of 1/r. Samples are the midpoints of equal steps of 1/r from the sphere to infinity.
-    Light that passes all samples has the color of the last one.
+    Light that passes all samples has the colour of the last one.
 
     Args:
         config: the settings.
@@ -100,8 +88,8 @@ class InvertedSphere(nn.Module):
         density = self.radius * functional.softplus(trunk[..., 0])
         towards_viewer = self.direction(-directions)[:, None].expand(-1, self.samples, -1)
         color = self.scale * torch.sigmoid(self.head(torch.cat((trunk[..., 1:], towards_viewer), -1)))
-        travelled = (1 / self.radius - inverse).expand(len(points), -1)
-        weights = render_weights(density, travelled, origins.new_full((len(points),), 1 / self.radius))
+        traveled = (1 / self.radius - inverse).expand(len(points), -1)
+        weights = render_weights(density, traveled, origins.new_full((len(points),), 1 / self.radius))
         return composite(weights.weights, color) + weights.transmittance[:, None] * color[:, -1]
 
     def _encoded(

@@ -1,4 +1,4 @@
-"""The BRDF field B: position → base color, roughness, metallic (METHOD §5)."""
+"""The BRDF field B: position → base colour, roughness, metallic (METHOD §5)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BrdfSample:
 class BrdfField(nn.Module):
     """Network of position whose outputs y give the material parameters as ½ + ½ tanh(y).
 
-    Roughness starts near ½; base color and metallic start as the settings say. Without `metals`, metallic is
+    Roughness starts near ½; base colour and metallic start as the settings say. Without `metals`, metallic is
     0 everywhere and has no gradient. Without `varying_roughness`, roughness is the same everywhere and is
     learned as the bias of its output; it keeps this value if it is later allowed to vary.
 

@@ -6,6 +6,7 @@ there is (sin φ sin θ, cos φ sin θ, cos θ): the layout of environment maps 
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 __all__ = [
+    "cos_edges",
     "directions_within",
     "interpolate",
     "map_directions",
@@ -49,9 +51,9 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
     return torch.stack(axes, -1).float()
 
 
-def texel_solid_angles(height: int, width: int) -> Float[Tensor, " T"]:
+def texel_solid_angles(height: int, width: int, device: torch.device | str = "cpu") -> Float[Tensor, " T"]:
     """Solid angles of the texels, row by row, in sr; their sum is 4π."""
-    edges = _cos_edges(height)
+    edges = cos_edges(height, device)
     rows = (edges[:-1] - edges[1:]) * 2 * math.pi / width
     return rows[:, None].expand(-1, width).reshape(-1)
 
@@ -64,22 +66,42 @@ def directions_within(
     Uniform shares are uniform in solid angle.
     """
     row, column = texel // width, texel % width
-    edges = _cos_edges(height).to(down)
+    edges = cos_edges(height, down.device).to(down.dtype)
     cos_theta = torch.lerp(edges[row], edges[row + 1], down)
     phi = 2 * math.pi * (column + across) / width
     sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
     return torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
 
 
-def texel_centers(height: int, width: int) -> Float[Tensor, "T 3"]:
+def texel_centers(height: int, width: int, device: torch.device | str = "cpu") -> Float[Tensor, "T 3"]:
     """The direction that halves the solid angle of each texel in height and width, row by row."""
-    half = torch.full((height * width,), 0.5)
-    return directions_within(torch.arange(height * width), half, half, height, width)
+    texel = torch.arange(height * width, device=device)
+    half = torch.full((height * width,), 0.5, device=device)
+    return directions_within(texel, half, half, height, width)
 
 
-def _cos_edges(height: int) -> Float[Tensor, " E"]:
-    """Cosines of the polar angles that bound the rows: halfway between neighboring rows."""
-    return ((torch.arange(height + 1) - 0.5).clamp(0, height - 1) * math.pi / (height - 1)).cos()
+@functools.lru_cache(maxsize=16)
+def cos_edges(
+    height: int,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
+    rows_at_poles: bool = True,
+) -> Float[Tensor, " E"]:
+    """Cosines of the polar angles that bound the rows of a map.
+
+    The result is kept, because training draws directions within texels in every step. Do not change it.
+
+    Args:
+        height: number of rows.
+        device: device of the result.
+        dtype: type of the result.
+        rows_at_poles: if True, the first and last row are at the poles, and an edge is halfway between two
+            rows; if False, all rows have the same height, and the edges of the outer rows are at the poles.
+    """
+    edge = torch.arange(height + 1, dtype=dtype, device=device)
+    if rows_at_poles:
+        return ((edge - 0.5).clamp(0, height - 1) * math.pi / (height - 1)).cos()
+    return (edge * math.pi / height).cos()
 
 
 def _columns_and_rows(

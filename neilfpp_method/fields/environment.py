@@ -29,8 +29,8 @@ __all__ = ["EVEN_ROWS", "EnvironmentLight", "TexelDirections"]
 UNIFORM_SHARE = 0.1
 """Share of the samples that ignore the radiance, so that the density is positive above every horizon."""
 MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""Weights of each neighbor and of the cell itself in the mean, over a cell, of the linear interpolation
-between cell centers.
+"""Weights of each neighbour and of the cell itself in the mean, over a cell, of the linear interpolation
+between cell centres.
 """
 EVEN_ROWS = 16
 """Rows of the map of an even light. Its texels are all equal; they are the directions that a fit samples."""
@@ -68,7 +68,7 @@ class EnvironmentLight(nn.Module):
         self.register_load_state_dict_pre_hook(_take_size)
 
     @torch.no_grad()
-    def be_even(self, even: bool) -> None:
+    def set_even(self, even: bool) -> None:
         """Make the light even, with the mean radiance of the map over solid angle, or a map again."""
         self.even = even
         if even and (self.log_radiance != self.log_radiance[:, :1, :1]).any():
@@ -137,13 +137,14 @@ class EnvironmentLight(nn.Module):
         self.log_radiance = self.log_radiance.new_zeros(3, height, width)
 
     def _texel_solid_angles(self) -> Float[Tensor, " T"]:
-        return texel_solid_angles(*self.log_radiance.shape[1:]).to(self.log_radiance)
+        _, height, width = self.log_radiance.shape
+        return texel_solid_angles(height, width, self.log_radiance.device).to(self.log_radiance.dtype)
 
     @torch.no_grad()
     def _texel_shares(self) -> Float[Tensor, "H W"]:
         """Share of each texel in all light: its mean interpolated radiance times its solid angle.
 
-        The interpolation also brightens the neighbors of a bright texel, so their probability is higher.
+        The interpolation also brightens the neighbours of a bright texel, so their probability is higher.
         """
         solid_angle = self._texel_solid_angles()
         mean = luminance(self.log_radiance.permute(1, 2, 0).exp())

@@ -87,7 +87,7 @@ class IncidentLightField(nn.Module):
 
 
 def exponential(exponent: Float[Tensor, "*B C"], initial_radiance: float) -> Float[Tensor, "*B 3"]:
-    """initial_radiance · e^exponent; a single channel is copied to all three colors.
+    """initial_radiance · e^exponent; a single channel is copied to all three colours.
 
     The exponent is clamped, but its derivative is 1 everywhere, so that values beyond the limit can return.
     """

@@ -29,7 +29,7 @@ class LampRays:
 
     Attributes:
         wi: unit directions from the points to the lamps.
-        distance: distances to the centers of the lamps, scene units.
+        distance: distances to the centres of the lamps, scene units.
         solid_angle: solid angles of the lamps as seen from the points, steradians.
         emission: share of its intensity that a lamp sends towards the point, in [0, 1].
     """
@@ -74,7 +74,7 @@ class Lamps(nn.Module):
         """Replace all lamps by these, or by the first `capacity` of them.
 
         Args:
-            position: centers, scene frame.
+            position: centres, scene frame.
             intensity: power per solid angle, on the axis if there is one.
             axis: unit axes, or zeros; if None, all lamps are isotropic.
         """
@@ -86,7 +86,7 @@ class Lamps(nn.Module):
         self.intensity.zero_()[: self.count] = intensity[: self.count]
 
     def rays_from(self, x: Float[Tensor, "N 3"]) -> LampRays:
-        """Rays from points towards the center of each lit lamp."""
+        """Rays from points towards the centre of each lit lamp."""
         return rays_towards(x, self.position[: self.count], self.axis[: self.count], self.radius)
 
     def radiance(self) -> Float[Tensor, "K 3"]:
@@ -97,7 +97,7 @@ class Lamps(nn.Module):
         """Radiance along rays from the lit lamps, without occlusion."""
         return rays.emission[..., None] * self.radiance()
 
-    def met(
+    def radiance_along(
         self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"], before: Float[Tensor, "N S"]
     ) -> Float[Tensor, "N S 3"]:
         """Radiance of the lamps that directions hit closer than `before`; overlapping lamps add up."""

@@ -53,7 +53,7 @@ class LightModel:
     def use(self, config: FreeLightConfig | MapLightConfig) -> None:
         """Switch to other settings. Whether an environment map is even may change; its size must not."""
         if isinstance(self.light, EnvironmentLight):
-            self.light.be_even(config.environment_height == 1)
+            self.light.set_even(config.environment_height == 1)
 
 
 def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> LightModel:
@@ -71,5 +71,5 @@ def make_light(config: NeilfConfig, response: str, initial_radiance: float) -> L
     lamps = Lamps(0 if settings.kind == "distant" else MAX_LAMPS, LAMP_RADIUS)
     height = settings.environment_height
     environment = EnvironmentLight(EVEN_ROWS if height == 1 else height, initial_radiance)
-    environment.be_even(height == 1)
+    environment.set_even(height == 1)
     return LightModel(environment, lamps)

@@ -2,8 +2,8 @@
 
 The product is the integrand of irradiance. A diffuse surface that nothing occludes therefore has almost no
 noise, and hardly any sample is wasted below the horizon. Sampling takes two steps, so that its cost does not
-grow with the size of the map: first a cell of neighboring texels, in proportion to the power of the cell
-times the cosine at its center, then a texel of the cell in proportion to its power.
+grow with the size of the map: first a cell of neighbouring texels, in proportion to the power of the cell
+times the cosine at its centre, then a texel of the cell in proportion to its power.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class _Cells:
         order: the texels, cell by cell.
         first: position in `order` of the first texel of each cell.
         last: position in `order` of the last texel of each cell.
-        center: unit direction of the center of each cell.
-        radius: upper bound on the angle between a center and a direction of its cell, radians.
+        center: unit direction of the centre of each cell.
+        radius: upper bound on the angle between a centre and a direction of its cell, radians.
         solid_angle: solid angle of each texel, sr.
     """
 
@@ -110,12 +110,12 @@ def _cells(height: int, width: int, device: torch.device) -> _Cells:
     order = of_texel.argsort(stable=True)
     size = of_texel.bincount()
     last = size.cumsum(0) - 1
-    directions = texel_centers(height, width).to(device)
+    directions = texel_centers(height, width, device)
     center = torch.zeros(len(size), 3, device=device).index_add(0, of_texel, directions)
     center = torch.nn.functional.normalize(center, dim=-1)
-    # A texel reaches at most half its height and width beyond its center.
+    # A texel reaches at most half its height and width beyond its centre.
     to_center = (directions * center[of_texel]).sum(-1).clamp(-1, 1).acos().max().item()
     half = math.hypot(math.pi / (height - 1), 2 * math.pi / width) / 2
     radius = min(to_center + half, math.pi / 2)
-    solid_angle = texel_solid_angles(height, width).to(device)
+    solid_angle = texel_solid_angles(height, width, device)
     return _Cells(of_texel, order, last - size + 1, last, center, radius, solid_angle)

@@ -28,7 +28,7 @@ __all__ = [
     "MlpSample",
     "geometric_init_",
     "middle_skip",
-    "weight_normalise_",
+    "weight_normalize_",
 ]
 
 SOFTPLUS_SHARPNESS = 100.0
@@ -216,7 +216,7 @@ def geometric_init_(mlp: Mlp, radius: float, extent: float, encoded: float) -> N
     row[:width] += torch.linalg.solve(gram + ridge, units.T @ missing).to(row.dtype)
 
 
-def weight_normalise_(mlp: Mlp) -> None:
+def weight_normalize_(mlp: Mlp) -> None:
     """Parametrise every weight row by length and direction (Salimans & Kingma 2016)."""
     for layer in mlp.layers:
         parametrizations.weight_norm(layer)

@@ -12,9 +12,9 @@ from neilfpp_method.fields.encodings import Raw, direction_encoding, position_en
 from neilfpp_method.fields.mlp import Mlp
 from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, OutgoingRadianceConfig
 
-__all__ = ["MID_GREY", "OutgoingRadianceField"]
+__all__ = ["MID_GRAY", "OutgoingRadianceField"]
 
-MID_GREY = 0.2
+MID_GRAY = 0.2
 """Default initial radiance: about 18 % grey, the mean of a well-exposed photograph."""
 DIRECTION_OCTAVES, DIRECTION_BANDS = 4, 4
 """Octaves or bands of the encoding of directions (NeILF++ §5)."""
@@ -42,7 +42,7 @@ class OutgoingRadianceField(nn.Module):
         feature_width: int,
         radius: float,
         scale: float,
-        start: float = MID_GREY,
+        start: float = MID_GRAY,
     ) -> None:
         super().__init__()
         self.scale = scale

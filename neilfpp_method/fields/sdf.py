@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method.fields.encodings import FrequencyEncoding, position_encoding, pull_back
-from neilfpp_method.fields.mlp import Mlp, geometric_init_, middle_skip, weight_normalise_
+from neilfpp_method.fields.mlp import Mlp, geometric_init_, middle_skip, weight_normalize_
 from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, SdfConfig
 
 __all__ = ["SdfField", "SdfSample"]
@@ -50,7 +50,7 @@ class SdfField(nn.Module):
         )
         geometric_init_(self.mlp, FIRST_RADIUS, extent=radius, encoded=0.0 if waves else 1.0)
         if waves:
-            weight_normalise_(self.mlp)
+            weight_normalize_(self.mlp)
 
     def forward(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         """Signed distance only."""

@@ -1,5 +1,8 @@
 """Derive findings from measurements of a run: each case has a limit, a likely cause and a remedy.
 
+Remedies name settings, which `neilfpp train` takes as `--config.train.sdf-steps` and so on, because users of
+`attach_neilf` have no command line.
+
 The limits are based on reasoning and on a few runs (docs/health.md). A finding means that something is wrong;
 its absence does not prove that the result is good.
 """
@@ -109,7 +112,8 @@ def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
                 step,
                 f"only {measured.opaque:.0%} of the object's pixels show a surface",
                 "a scene box that misses the object, or masks that are inverted",
-                "look at the picture of `neilfpp inspect`",
+                "check that the object lies in the unit sphere of the scene and that masks are 1 on it "
+                "(`neilfpp inspect` draws both for a capture)",
             )
         ]
     if measured.sharp < MIN_SHARP:
@@ -121,7 +125,8 @@ def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
                 f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is "
                 "fog",
                 "a scene box that contains the cameras, or too few views, steps or masks",
-                "look at `neilfpp inspect`, give masks, or increase --config.train.sdf-steps",
+                "check the scene box (`neilfpp inspect` draws that of a capture), give masks, or train the "
+                "geometry for more steps (train.sdf_steps)",
             )
         ]
     return []
@@ -138,7 +143,7 @@ def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
             step,
             f"the base colour of {measured.at_bound:.0%} of the surface is black or white",
             "a light with a wrong scale",
-            "give the light with --light, or read docs/light.md",
+            "give a known environment map (light.map, in `neilfpp train` --light), or read docs/light.md",
         )
     ]
 
@@ -154,7 +159,7 @@ def nothing_shaded(steps: int, step: int) -> list[Finding]:
             step,
             f"no surface point was shaded for {steps} steps, so material and light learn nothing",
             "a distance field that never formed a surface",
-            "look at the preview of SDF init in the run's folder",
+            "look at a rendering of the geometry (in a run folder previews/sdf_init.png)",
         )
     ]
 
@@ -170,7 +175,8 @@ def few_light_points(points: int, step: int) -> list[Finding]:
             step,
             f"the light was fitted to only {points} surface points, without a decision about lamps",
             "masks or a surface that leave few pixels to shade",
-            "look at the previews, or increase --config.train.rays",
+            "check the masks and a rendering of the geometry, or use more rays per step (train.rays, in your "
+            "own loop the size of the batch)",
         )
     ]
 
@@ -186,6 +192,7 @@ def skipped_steps(skipped: int, step: int) -> list[Finding]:
             step,
             f"{skipped} of {step} steps were skipped, as they were not finite",
             "pixels far above the rest, or learning rates that are too high",
-            "look at `neilfpp inspect` for the brightest pixels",
+            "look for the brightest pixels (`neilfpp inspect` reports those of a capture), or lower the "
+            "learning rates (optimizer)",
         )
     ]

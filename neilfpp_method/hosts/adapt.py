@@ -24,7 +24,7 @@ def adapt(host: object, response: str) -> Host | ImageHost:
 
     Args:
         host: what the caller of `attach_neilf` passed.
-        response: meaning of its colors, if it is a nerfstudio model.
+        response: meaning of its colours, if it is a nerfstudio model.
 
     Raises:
         UserError: it has none of the forms of docs/hosts.md, or is called with other arguments.

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import PixelBatch
 
-__all__ = ["check_batch", "check_like", "check_points", "check_rows", "pixel_batch"]
+__all__ = ["check_batch", "check_like", "check_points", "check_rows", "check_step", "pixel_batch"]
 
 
 def pixel_batch(origins: Tensor, directions: Tensor, color: Tensor, mask: Tensor | None = None) -> PixelBatch:
@@ -56,6 +57,26 @@ def check_batch(batch: Any) -> None:
         check_rows(name, getattr(batch, name), len(batch), 3)
     for name in ("mask", "mask_known", "image_gradient"):
         check_rows(name, getattr(batch, name), len(batch))
+
+
+def check_step(step: Any) -> None:
+    """Check that a step is its index, counted from 0, or the name of a stage.
+
+    Raises:
+        UserError: it is not.
+    """
+    stages = [stage.value for stage in Stage]
+    remedy = f"give the index of the step, or one of {', '.join(stages)}"
+    if isinstance(step, str):
+        if step not in stages:
+            raise UserError(f"unknown stage '{step}'", remedy)
+        return
+    try:
+        number = int(step)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise UserError(f"the step is {step!r}", remedy) from error
+    if number < 0:
+        raise UserError(f"step {number}", "count steps from 0")
 
 
 def check_rows(name: str, value: Any, count: int, width: int | None = None) -> None:

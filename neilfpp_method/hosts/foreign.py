@@ -78,7 +78,7 @@ class ForeignHost(nn.Module):
         # The proxy is a submodule of `AttachedNeilf`, not of this module.
         object.__setattr__(self, "proxy", proxy)
         self.name = host_name(host)
-        self.coarse_said = False
+        self.warned_of_precision = False
         for capability in PASSED_ON:
             if hasattr(host, capability):
                 object.__setattr__(self, capability, getattr(host, capability))
@@ -140,7 +140,7 @@ class ForeignHost(nn.Module):
         if self.proxy is None or len(rays) == 0:
             return
         if self.proxy.steps == 0 and answers_secondary_rays(self.inner):
-            self.proxy.look_around(self.render, rays, hits)
+            self.proxy.explore(self.render, rays, hits)
         self.proxy.observe(rays, hits)
 
     def _render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
@@ -150,8 +150,8 @@ class ForeignHost(nn.Module):
         return RegularisedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
     def _precise(self, rays: RayBatch, hits: SurfaceHits) -> SurfaceHits:
-        if hits.position.dtype in COARSE and not self.coarse_said:
-            self.coarse_said = True
+        if hits.position.dtype in COARSE and not self.warned_of_precision:
+            self.warned_of_precision = True
             digits = torch.finfo(hits.position.dtype).eps
             log.warning(
                 "%s: its position is %s, whose relative precision is %.0e; return positions in float32",

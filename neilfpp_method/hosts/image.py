@@ -22,7 +22,7 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 __all__ = ["depth_normals", "image_hits", "rays_like"]
 
 JUMP = 0.1
-"""Relative difference of their distances above which neighboring pixels belong to two surfaces."""
+"""Relative difference of their distances above which neighbouring pixels belong to two surfaces."""
 SOLID = 0.5
 """Smallest opacity of a pixel that shows a surface."""
 
@@ -50,7 +50,7 @@ def image_hits(
             the opacity first.
         opacity: opacity of each pixel; below ½ the pixel is a miss.
         normal: outward normals of any length, scene frame; if None, they are computed from the depths of
-            neighboring pixels.
+            neighbouring pixels.
         along_ray: whether `depth` is the distance along the ray instead of the z-depth.
 
     Raises:
@@ -89,8 +89,8 @@ def image_hits(
 def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) -> Float[Tensor, "H W 3"]:
     """Unit normals from the positions of pixels, oriented towards the eye.
 
-    They are cross products of differences to the neighbor with the closer depth along each axis. A normal is
-    zero if both neighbors along an axis lie on another surface.
+    They are cross products of differences to the neighbour with the closer depth along each axis. A normal is
+    zero if both neighbours along an axis lie on another surface.
     """
     distance = (position - eye).norm(dim=-1)
     right, right_ok = _nearer_step(position, distance, 1)
@@ -103,7 +103,7 @@ def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) ->
 def _nearer_step(
     position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int
 ) -> tuple[Tensor, Tensor]:
-    """The difference to the neighbor of closer depth along an axis, and whether both are on one surface."""
+    """The difference to the neighbour of closer depth along an axis, and whether both are on one surface."""
     forward, backward = (position.roll(-1, axis) - position), (position - position.roll(1, axis))
     rise = (distance.roll(-1, axis) - distance).abs()
     edge = torch.arange(position.shape[axis], device=position.device).view(-1, *([1] * (1 - axis)))

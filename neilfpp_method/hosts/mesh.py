@@ -15,11 +15,11 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.fields.background import background_field
-from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
-from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
+from neilfpp_method.hosts.radiance import background_field, radiance_field
+from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
@@ -55,32 +55,17 @@ class MeshHost(nn.Module):
     Args:
         mesh: triangles in the scene frame.
         config: the settings.
-        radiance_scale: largest radiance of R.
-        background: "inverted_sphere"; any other value means a constant background.
-        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
-        radiance_start: initial radiance of R.
+        facts: the range and the initial value of R, and the background: "inverted_sphere", or constant for
+            any other value.
     """
 
     stages = FIXED_GEOMETRY
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        config: NeilfConfig,
-        radiance_scale: float,
-        background: str = "constant",
-        background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        radiance_start: float = MID_GREY,
-    ) -> None:
+    def __init__(self, mesh: Mesh, config: NeilfConfig, facts: SceneFacts) -> None:
         super().__init__()
-        radius = config.volume.radius
-        self.radiance_field = OutgoingRadianceField(
-            config.radiance, config.encoding, 0, radius, radiance_scale, radiance_start
-        )
-        self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = background_field(
-            background, config.background, config.encoding, radius, radiance_scale, self.background_color
-        )
+        self.radiance_field = radiance_field(config, facts, 0)
+        self.register_buffer("background_color", torch.tensor(facts.background_color))
+        self.background = background_field(config, facts)
         triangles = mesh.vertices[mesh.faces]
         across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         outward = safe_normalize(across, eps=TINY)
@@ -97,16 +82,16 @@ class MeshHost(nn.Module):
     def render(self, rays: RayBatch) -> SurfaceHits:
         """First hit of each ray with R there; the background for a ray that misses."""
         with torch.no_grad():
-            met = self.cross(rays)
-        wo = -rays.directions[met.rows]
-        radiance = self.radiance_field(met.position, wo, met.normal, met.position[:, :0])
+            hit = self.cross(rays)
+        wo = -rays.directions[hit.rows]
+        radiance = self.radiance_field(hit.position, wo, hit.normal, hit.position[:, :0])
         nothing, zeros = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
         return SurfaceHits(
-            color=self._background(rays, met.rows).to(radiance.dtype).index_put((met.rows,), radiance),
-            position=rays.origins.index_put((met.rows,), met.position),
-            normal=nothing.index_put((met.rows,), met.normal),
-            opacity=zeros.index_fill(0, met.rows, 1.0),
-            concentration=zeros.index_put((met.rows,), met.outside.to(zeros.dtype)),
+            color=self._background(rays, hit.rows).to(radiance.dtype).index_put((hit.rows,), radiance),
+            position=rays.origins.index_put((hit.rows,), hit.position),
+            normal=nothing.index_put((hit.rows,), hit.normal),
+            opacity=zeros.index_fill(0, hit.rows, 1.0),
+            concentration=zeros.index_put((hit.rows,), hit.outside.to(zeros.dtype)),
         )
 
     @torch.no_grad()
@@ -114,14 +99,14 @@ class MeshHost(nn.Module):
         """R where rays from x along wi hit the mesh; the inside of the mesh stops rays and is black."""
         directions = wi.reshape(-1, 3)
         origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
-        met = self.cross(RayBatch(origins, directions))
+        hit = self.cross(RayBatch(origins, directions))
         radiance, distance = torch.zeros_like(directions), torch.full_like(directions[:, 0], torch.inf)
-        distance[met.rows] = (met.position - origins[met.rows]).norm(dim=-1)
-        outside = torch.nonzero(met.outside)[:, 0]
+        distance[hit.rows] = (hit.position - origins[hit.rows]).norm(dim=-1)
+        outside = torch.nonzero(hit.outside)[:, 0]
         for part in outside.split(RADIANCE_AT_ONCE):
-            rows, position = met.rows[part], met.position[part]
+            rows, position = hit.rows[part], hit.position[part]
             radiance[rows] = self.radiance_field(
-                position, -directions[rows], met.normal[part], position[:, :0]
+                position, -directions[rows], hit.normal[part], position[:, :0]
             )
         distance = distance.view(wi.shape[:2])
         return SceneLight(distance.isfinite(), radiance.view(wi.shape), distance)
@@ -133,11 +118,11 @@ class MeshHost(nn.Module):
         """Normals smoothed within `volume.normal_radius` of hits; the hit normals if it is 0."""
         if self.normal_radius == 0:
             return normal
-        up = normal.repeat_interleave(NEIGHBOURS, 0)
+        up = normal.repeat_interleave(NEIGHBORS, 0)
 
         def normals_below(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-            met = self.cross(RayBatch(x + self.normal_radius * up, -up))
-            return torch.zeros_like(x).index_put((met.rows,), met.normal * met.outside[:, None])
+            hit = self.cross(RayBatch(x + self.normal_radius * up, -up))
+            return torch.zeros_like(x).index_put((hit.rows,), hit.normal * hit.outside[:, None])
 
         return smooth_normals(normals_below, position, normal, self.normal_radius)
 
@@ -177,11 +162,11 @@ class MeshHost(nn.Module):
             self._tracers[device] = embree or tree_tracer(build_tree(self.triangles))
         return self._tracers[device]
 
-    def _background(self, rays: RayBatch, met: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:
+    def _background(self, rays: RayBatch, hit_rows: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:
         """Radiance of the background for rays that miss; rows of other rays are not meaningful."""
         if self.background is None:
             return self.background_color.expand(len(rays), 3)
-        missed = torch.nonzero(torch.ones_like(rays.origins[:, 0]).index_fill(0, met, 0.0))[:, 0]
+        missed = torch.nonzero(torch.ones_like(rays.origins[:, 0]).index_fill(0, hit_rows, 0.0))[:, 0]
         radiance = self.background(rays.origins[missed], rays.directions[missed])
         return radiance.new_zeros(len(rays), 3).index_put((missed,), radiance)
 

@@ -4,7 +4,7 @@
 |----------|----------------------------------------------------------------------------------|
 | color    | `rgb`: display values (sRGB) or linear values, times `radiance_scale`            |
 | position | `expected_depth`, `depth`: distance along the unit ray                           |
-| normal   | `normal` (a vector), `pred_normals`, `normals` (colors (n + 1)/2); normalised    |
+| normal   | `normal` (a vector), `pred_normals`, `normals` (colours (n + 1)/2); normalised   |
 | opacity  | `accumulation`                                                                   |
 """
 
@@ -35,7 +35,7 @@ OWN_LOSSES = "own"
 DEPTHS = ("expected_depth", "depth")
 NORMALS = ("normal", "pred_normals", "normals")
 COLOR_CODED = ("pred_normals", "normals")
-"""Outputs that hold normals as colors (n + 1)/2."""
+"""Outputs that hold normals as colours (n + 1)/2."""
 PIXEL_AREA = 1e-6
 """Area of a pixel at distance 1, which cone-casting samplers need: that of an image of 1000 pixels width."""
 SAME_FRAME = Normalisation(1.0, (0.0, 0.0, 0.0))
@@ -51,7 +51,7 @@ class NerfstudioHost(nn.Module):
 
     Args:
         model: a model that takes rays: `NeuSModel`, `NerfactoModel` with `predict_normals`, …
-        response: meaning of the rendered color: "srgb" (trained on 8-bit images) or "linear".
+        response: meaning of the rendered colour: "srgb" (trained on 8-bit images) or "linear".
         radiance_scale: linear radiance of a rendered 1; above 1 for a model whose range [0, 1] shows an HDR
             scene.
         frame: transformation between the model's frame (as world frame) and the scene frame, in which the
@@ -85,7 +85,7 @@ class NerfstudioHost(nn.Module):
         """Render rays with the model.
 
         Raises:
-            UserError: the model has no output for the color, the depth, the normal or the opacity.
+            UserError: the model has no output for the colour, the depth, the normal or the opacity.
         """
         if len(rays) == 0:
             # Some models fail without rays.
@@ -111,7 +111,7 @@ class NerfstudioHost(nn.Module):
         return RegularisedHits(self.read_outputs(batch.rays, outputs), terms)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
-        """All parameters that the model trains, as `geometry`: its fields hold shape and color together."""
+        """All parameters that the model trains, as `geometry`: its fields hold shape and colour together."""
         return {"geometry": self._moving}
 
     # ---------------------------------------------------------------------------------------------- the model
@@ -167,5 +167,5 @@ class NerfstudioHost(nn.Module):
         return LossTerm(torch.stack(regularisers).sum() if regularisers else batch.color.new_zeros(()))
 
     def _as_drawn(self, color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Pixels in the units of the model's color. Pixels and model have the same response."""
+        """Pixels in the units of the model's colour. Pixels and model have the same response."""
         return color if self.response == "srgb" else color / self.radiance_scale

@@ -48,7 +48,7 @@ class OutputCheck:
         Args:
             rays: the rays that were rendered.
             hits: what the host returned, `SurfaceHits` if the host is correct.
-            color_moves: whether the color should carry a gradient to the host.
+            color_moves: whether the colour should carry a gradient to the host.
 
         Raises:
             UserError: an output is invalid; the message names host, output and remedy.
@@ -60,7 +60,7 @@ class OutputCheck:
             self.normals_known = check_normals(self.name, hits, self.hit_share)
 
     def _constant_color(self) -> None:
-        """Report a color without gradient in a stage that trains the host."""
+        """Report a colour without gradient in a stage that trains the host."""
         problem = f"{self.name}: its color has no gradient to the host's parameters, which this stage trains"
         remedy = "render without torch.no_grad and without detach"
         if not self.may_be_constant:

@@ -12,7 +12,7 @@ few dozen steps.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
@@ -33,9 +33,9 @@ POINTS = 32_768
 EVERY = 64
 """Steps between two refreshes. The first refreshes are at steps 1, 2, 4, 8, …"""
 ROUNDS, ROUND = 16, 512
-"""Number of batches, and rays per batch, with which `look_around` explores the surface."""
+"""Number of batches, and rays per batch, with which `explore` explores the surface."""
 SPREAD = 0.2
-"""Largest offset of the targets of `look_around` from known hits, per axis, scene units."""
+"""Largest offset of the targets of `explore` from known hits, per axis, scene units."""
 START = 0.75
 """Height above the grid's surface at which rays start, in cells; tracing ends at a quarter cell."""
 APART = 2.0
@@ -79,7 +79,7 @@ class ProxyReport:
 
 
 @dataclass(frozen=True)
-class CameraRays:
+class ObservedRays:
     """Camera rays with the distances of the host's hits, infinite for a miss."""
 
     rays: RayBatch
@@ -128,9 +128,7 @@ class SurfaceProxy(nn.Module):
             self.refresh()
 
     @torch.no_grad()
-    def look_around(
-        self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits
-    ) -> None:
+    def explore(self, render: Callable[[RayBatch], SurfaceHits], rays: RayBatch, hits: SurfaceHits) -> None:
         """Explore the surface before the first step, so that there is enough of it to trace.
 
         Rays go from the origins of the first batch to points near its hits.
@@ -155,44 +153,37 @@ class SurfaceProxy(nn.Module):
         """Measure the error on the rays since the last refresh, add them, and rebuild the grid."""
         if not self._pending:
             return
-        rays = RayBatch(
-            *(torch.cat([getattr(r, name) for r, _ in self._pending]) for name in ("origins", "directions"))
-        )
-        joined = [
-            torch.cat(parts) for parts in zip(*(self._columns(r, h) for r, h in self._pending), strict=True)
-        ]
-        points, distance, hit, clear = joined
+        rays, hits = (_joined(parts) for parts in zip(*self._pending, strict=True))
         self._pending.clear()
+        hit = hits.is_hit(self.hit_share) & (hits.normal.norm(dim=-1) > 0.5)
+        distance = torch.where(hit, (hits.position - rays.origins).norm(dim=-1), torch.inf)
+        points = torch.cat((hits.position, hits.normal, hits.color), -1)
+        hit &= points.isfinite().all(-1)
         if self._known_surface() is not None:
-            rows = torch.nonzero(hit | clear)[:, 0]
-            self._measure(CameraRays(rays[rows], distance[rows]))
+            rows = torch.nonzero(hit | (hits.opacity < CLEAR))[:, 0]
+            observed = ObservedRays(rays[rows], distance[rows])
+            traced = self._trace(observed.rays)
+            self._report = self._compare(observed, traced)
+            self._remove_crossed_points(observed, traced)
         stamp = torch.full_like(points[:, :1], float(self.steps))
         self.points.keep(torch.cat((points, stamp), -1)[hit].flip(0))
         self._surface = self._fused()
-
-    def _columns(self, rays: RayBatch, hits: SurfaceHits) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Position, normal and radiance in columns; distances; which rays hit, and which miss."""
-        hit = hits.is_hit(self.hit_share) & (hits.normal.norm(dim=-1) > 0.5)
-        distance = torch.where(hit, (hits.position - rays.origins).norm(dim=-1), torch.inf)
-        columns = torch.cat((hits.position, hits.normal, hits.color), -1)
-        return columns, distance, hit & columns.isfinite().all(-1), hits.opacity < CLEAR
 
     def _fused(self) -> FusedSurface:
         rows = self.points.kept()
         rows = rows[rows[:, 3:6].square().sum(-1) > 0]
         return fuse(rows[:, :3], rows[:, 3:6], rows[:, 6:9], self.radius, self.resolution)
 
-    def _measure(self, camera_rays: CameraRays) -> None:
-        """Compare new rays with the grid, and remove the points that they pass through."""
-        traced = self._trace(camera_rays.rays)
-        hit = camera_rays.distance.isfinite()
-        error = (traced.distance - camera_rays.distance)[hit & traced.hit].abs()
+    def _compare(self, observed: ObservedRays, traced: GridHits) -> ProxyReport:
+        """Compare new rays of the host with those through the grid."""
+        hit = observed.distance.isfinite()
+        error = (traced.distance - observed.distance)[hit & traced.hit].abs()
         rows = self.points.kept()
         valid = rows[:, 3:6].square().sum(-1) > 0
         median, error_95 = (
             error.quantile(torch.tensor([0.5, 0.95]).to(error)).tolist() if len(error) else (0.0, 0.0)
         )
-        self._report = ProxyReport(
+        return ProxyReport(
             points=int(valid.sum()),
             age=(self.steps - rows[valid, 9]).mean().item() if valid.any() else 0.0,
             agreement=(hit == traced.hit).float().mean().item() if len(hit) else 1.0,
@@ -200,14 +191,18 @@ class SurfaceProxy(nn.Module):
             error_95=error_95,
             cell=self.cell,
         )
-        through = traced.hit & (camera_rays.distance > traced.distance + APART * self.cell)
-        crossed = camera_rays.rays.origins + traced.distance[:, None] * camera_rays.rays.directions
+
+    def _remove_crossed_points(self, observed: ObservedRays, traced: GridHits) -> None:
+        """Remove the points that rays of the host pass through."""
+        through = traced.hit & (observed.distance > traced.distance + APART * self.cell)
+        crossed = observed.rays.origins + traced.distance[:, None] * observed.rays.directions
         stale = torch.zeros(self.resolution**3, dtype=torch.bool, device=crossed.device)
         stale[self._cells(crossed[through])] = True
-        # Points in neighboring cells are removed as well.
+        # Points in neighbouring cells are removed as well.
         volume = stale.view(1, 1, *[self.resolution] * 3).float()
         stale = nn.functional.max_pool3d(volume, 3, 1, 1).view(-1) > 0
         # `rows` is a view of the ring: this writes to the stored points.
+        rows = self.points.kept()
         rows[stale[self._cells(rows[:, :3])], 3:6] = 0.0
 
     def _cells(self, x: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
@@ -244,7 +239,7 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Hits of rays with the grid's surface, without gradient; the color of a miss is black."""
+        """Hits of rays with the grid's surface, without gradient; the colour of a miss is black."""
         surface = self._known_surface()
         nothing, zero = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
         if surface is None:
@@ -318,6 +313,11 @@ class SurfaceProxy(nn.Module):
 
 
 Part = TypeVar("Part", RayBatch, SurfaceHits)
+
+
+def _joined(parts: Sequence[Part]) -> Part:
+    """All parts as one batch."""
+    return type(parts[0])(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0])))
 
 
 def _tensors(part: RayBatch | SurfaceHits) -> dict[str, Tensor]:

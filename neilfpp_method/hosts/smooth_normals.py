@@ -19,18 +19,18 @@ from torch.nn import functional
 
 from neilfpp_method.shading.frame import local_frame, safe_normalize
 
-__all__ = ["NEIGHBOURS", "smooth_normals"]
+__all__ = ["NEIGHBORS", "smooth_normals"]
 
 RINGS = ((6, 1 / 3), (10, 2 / 3), (16, 1.0))
-"""Number of neighbors on each ring around the point, and the ring's radius relative to the outermost."""
-NEIGHBOURS = sum(count for count, _ in RINGS)
+"""Number of neighbours on each ring around the point, and the ring's radius relative to the outermost."""
+NEIGHBORS = sum(count for count, _ in RINGS)
 """Number of points at which normals are evaluated, per shaded point."""
 UNLIKE = 0.2
 """Residual of a unit normal at which its weight is 1/√e; it corresponds to 11.5°."""
 ROUNDS = 4
 """Rounds of iteratively reweighted least squares."""
 RIDGE = 1e-2
-"""Ridge penalty, relative to the weight of one neighbor, for slopes that no neighbor determines."""
+"""Ridge penalty, relative to the weight of one neighbour, for slopes that no neighbour determines."""
 
 
 @torch.no_grad()
@@ -43,11 +43,11 @@ def smooth_normals(
     """Smoothed unit normals at surface points.
 
     Args:
-        gradient: gradient of the signed distance; called with `NEIGHBOURS` points around each point.
+        gradient: gradient of the signed distance; called with `NEIGHBORS` points around each point.
         position: points on the surface, scene frame.
         normal: their unit normals, not smoothed.
-        radius: radius of the neighborhood, scene units. Relief that is finer than this and flatter than about
-            10° is lost.
+        radius: radius of the neighbourhood, scene units. Relief that is finer than this and flatter than
+            about 10° is lost.
     """
     ring = _rings(position)
     around = position[:, None] + radius * (ring @ local_frame(normal)[:, :2])

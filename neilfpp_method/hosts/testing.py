@@ -4,8 +4,8 @@
 results do not depend on the batch and that rendering has no side effects. The other checks are in this
 module. docs/hosts.md lists which of a set of planted defects the suite finds.
 
-The suite cannot determine whether colors are linear, which would need a photograph with known radiance. It
-does detect the most common symptom: colors that are clipped at 1.
+The suite cannot determine whether colours are linear, which would need a photograph with known radiance. It
+does detect the most common symptom: colours that are clipped at 1.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ OFF_RAY = 1e-2
 FACING = 0.9
 """Smallest share of hits whose normal must face the viewer; blended normals at silhouettes may face away."""
 CLIPPED = 0.01
-"""Share of color values of exactly 1, if that is their maximum, above which colors count as clipped."""
+"""Share of colour values of exactly 1, if that is their maximum, above which colours count as clipped."""
 FAR = 100.0
 """Distance from which rays start that lead away from the scene, scene units."""
 

@@ -1,4 +1,4 @@
-"""Checks of a host's behavior: results do not depend on the batch, and there are no side effects."""
+"""Checks of a host's behaviour: results do not depend on the batch, and there are no side effects."""
 
 from __future__ import annotations
 

@@ -25,11 +25,11 @@ NEAR = 0.05
 ASIDE = 0.6
 """Tangent of the angle between both views."""
 BESIDE = 0.01
-"""Distance between neighboring rays, scene units."""
+"""Distance between neighbouring rays, scene units."""
 STEEP = 8.0
 """Neighboring hits that are further apart than this multiple of their rays' distance lie on two surfaces."""
 TILTED = 10.0
-"""Largest median angle between normals and the surface through neighboring hits, degrees."""
+"""Largest median angle between normals and the surface through neighbouring hits, degrees."""
 SPHERE = 1.5
 """Largest median distance of hits from the origin, scene units; the object may stand on a ground."""
 
@@ -60,17 +60,17 @@ def _from_close_by(case: Case) -> None:
     )
 
 
-def _normals_of_neighbours(case: Case) -> None:
-    """Compare normals with cross products of differences between the hits of four neighboring rays."""
+def _normals_of_neighbors(case: Case) -> None:
+    """Compare normals with cross products of differences between the hits of four neighbouring rays."""
     d = case.rays.directions[case.hit]
     side = normalize(torch.linalg.cross(d, d.roll(1, dims=-1) + torch.tensor([0.3, 0.1, -0.2]).to(d)), dim=-1)
     up = torch.linalg.cross(d, side)
     origins = case.rays.origins[case.hit]
-    neighbours = [
+    neighbors = [
         case.constants(RayBatch(origins + sign * BESIDE * axis, d)) for axis in (side, up) for sign in (1, -1)
     ]
-    across, along = (a.position - b.position for a, b in (neighbours[:2], neighbours[2:]))
-    hit_by_all = torch.stack([f.is_hit(HIT_SHARE) for f in neighbours]).all(0)
+    across, along = (a.position - b.position for a, b in (neighbors[:2], neighbors[2:]))
+    hit_by_all = torch.stack([f.is_hit(HIT_SHARE) for f in neighbors]).all(0)
     near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * STEEP * BESIDE
     rows = hit_by_all & near
     if rows.sum() < 8:
@@ -79,7 +79,7 @@ def _normals_of_neighbours(case: Case) -> None:
     implied = normalize(torch.linalg.cross(across, along), dim=-1)[rows]
     normal = case.hits.normal.detach()[case.hit][rows]
     angle = (implied * normal).sum(-1).abs().clamp_max(1.0).acos().rad2deg().median().item()
-    broken = f"half of its normals differ by {angle:.0f}° or more from the surface through neighboring hits"
+    broken = f"half of its normals differ by {angle:.0f}° or more from the surface through neighbouring hits"
     case.require(angle < TILTED, f"{broken}: take the gradient of the field that is rendered")
 
 
@@ -102,4 +102,4 @@ def _require_same_hits(
     case.require(same >= AGREE, f"{lost}: {broken or 'is the depth a distance along the ray?'}")
 
 
-GEOMETRY_CHECKS = (_in_the_sphere, _another_view, _from_afar, _from_close_by, _normals_of_neighbours)
+GEOMETRY_CHECKS = (_in_the_sphere, _another_view, _from_afar, _from_close_by, _normals_of_neighbors)

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields.background import background_field
-from neilfpp_method.fields.outgoing_radiance import MID_GREY, OutgoingRadianceField
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularisedHits
+from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import smooth_normals
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
@@ -68,42 +68,32 @@ class VolSdfHost(nn.Module):
 
     Args:
         config: the settings.
-        radiance_scale: largest radiance of R.
-        background: "none", "constant" or "inverted_sphere", after "auto" has been resolved.
-        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        facts: the range and the initial value of R, and the background, which is not "auto" any more.
         points: oriented points on the surface, scene frame, for L_pcd.
-        radiance_start: initial radiance of R.
         cameras: camera positions, scene frame; the space around them is empty (`volume.free_space`).
     """
 
     def __init__(
         self,
         config: NeilfConfig,
-        radiance_scale: float,
-        background: str,
-        background_color: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        facts: SceneFacts,
         points: OrientedPoints | None = None,
-        radiance_start: float = MID_GREY,
         cameras: Float[Tensor, "V 3"] | None = None,
     ) -> None:
         super().__init__()
         self.config = config
-        self.radiance_scale = radiance_scale
-        self.background_kind = background
+        self.radiance_scale = facts.radiance_scale
+        self.background_kind = facts.background
         # Buffers follow the host to its device. They are not in checkpoints, as the capture has them.
         self.register_buffer("point_position", None if points is None else points.position, persistent=False)
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
         radius = config.volume.radius
         sdf = config.host.sdf
         self.sdf_field = SdfField(sdf, config.encoding, radius)
-        self.radiance_field = OutgoingRadianceField(
-            config.radiance, config.encoding, sdf.feature_width, radius, radiance_scale, radiance_start
-        )
+        self.radiance_field = radiance_field(config, facts, sdf.feature_width)
         self.density = LaplaceDensity(config.volume.beta_init)
-        self.register_buffer("background_color", torch.tensor(background_color))
-        self.background = background_field(
-            background, config.background, config.encoding, radius, radiance_scale, self.background_color
-        )
+        self.register_buffer("background_color", torch.tensor(facts.background_color))
+        self.background = background_field(config, facts)
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
@@ -258,14 +248,17 @@ class VolSdfHost(nn.Module):
             opacity=zeros,
             concentration=zeros,
         )
-        rows = torch.nonzero(span.some)[:, 0]
+        rows = torch.nonzero(span.has_part)[:, 0]
         if not len(rows):
             return missed
         part = Interval(span.interval.near[rows], span.interval.far[rows])
-        met = self._march(rays[rows], part).hits
+        visible = self._march(rays[rows], part).hits
         return replace(
             missed,
-            **{f.name: getattr(missed, f.name).index_put((rows,), getattr(met, f.name)) for f in fields(met)},
+            **{
+                f.name: getattr(missed, f.name).index_put((rows,), getattr(visible, f.name))
+                for f in fields(SurfaceHits)
+            },
         )
 
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
@@ -290,13 +283,8 @@ class VolSdfHost(nn.Module):
         return March(distances, surface, hits)
 
     def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
-        near, far = interval.near, interval.far
-        with torch.no_grad():
-            beta = self.density.beta()
-            samples = error_bounded_samples(
-                self.sdf, rays.origins, rays.directions, near, far, beta, volume, self.training
-            )
-        return samples.distances
+        beta = self.density.beta().detach()
+        return error_bounded_samples(self.sdf, rays, interval, beta, volume, self.training).distances
 
     def _blend(
         self,

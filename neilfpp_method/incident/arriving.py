@@ -59,7 +59,7 @@ def incident_radiance(
     else:
         scene = sources.scene(x, wi)
         radiance, nearest = _behind_scene(scene, sources.light, x, wi), scene.distance
-    return radiance + sources.lamps.met(x, wi, nearest) if sources.lamps.count else radiance
+    return radiance + sources.lamps.radiance_along(x, wi, nearest) if sources.lamps.count else radiance
 
 
 def _from_light(sources: Sources, x: Float[Tensor, "N 3"], drawn: IncidentSamples) -> Incident:

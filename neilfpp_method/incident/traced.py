@@ -24,7 +24,7 @@ surface, and contributes little light.
 """
 MAX_START = 0.2
 """Largest distance of the start of a ray from its surface point, scene units (published code). A ray that has
-to start further away is left out: it could start behind a neighboring surface, and if it started closer, it
+to start further away is left out: it could start behind a neighbouring surface, and if it started closer, it
 would hit the soft layer of its own surface.
 """
 
@@ -64,14 +64,14 @@ def trace_light(
         hit_share: smallest concentration of the rendering weight that counts as a hit.
     """
     position, normal = position.detach(), normal.detach()
-    rows = _random_rows(position.shape[0], config.rays_per_point, position.device)
-    position, normal = position[rows], normal[rows]
+    chosen = _random_rows(position.shape[0], config.rays_per_point, position.device)
+    position, normal = position[chosen], normal[chosen]
     wi = _cone_directions(normal, math.cos(math.radians(MAX_ANGLE_DEG)))
     start = off_surface(host, position, normal, wi, config.offset)
-    worth = (start - position).norm(dim=-1) <= MAX_START
+    is_traced = (start - position).norm(dim=-1) <= MAX_START
     if isinstance(host, PredictsMisses):
-        worth &= host.may_hit(RayBatch(start, wi))
-    rows = torch.nonzero(worth)[:, 0]
+        is_traced &= host.may_hit(RayBatch(start, wi))
+    rows = torch.nonzero(is_traced)[:, 0]
     position, start, wi = position[rows], start[rows], wi[rows]
     with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):
         hits = host.render(RayBatch(start, wi))

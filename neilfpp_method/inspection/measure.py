@@ -21,7 +21,7 @@ THUMBNAIL_SIDE = 160
 """Longest side of the thumbnail of a view, in pixels."""
 SHARPNESS_SIDE = 1600
 """Longest side at which sharpness is measured, in pixels; finer detail is blurred by demosaicing."""
-MIDDLE_GREY = 0.18
+MIDDLE_GRAY = 0.18
 """Linear value to which the luminance of the object is scaled before sharpness is measured."""
 BORDER_SHARE = 0.5
 """Smallest share of border pixels of one colour with which that colour is the background."""
@@ -142,15 +142,15 @@ def _off_the_background(
 def _sharpness(light: Float32[np.ndarray, "H W"], chosen: Bool[np.ndarray, "H W"], typical: float) -> float:
     if typical <= 0:
         return 0.0
-    grey = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GREY / typical)).clamp(0, 1)).numpy()
-    grey, on_object = (
-        _fitted(grey, SHARPNESS_SIDE),
+    gray = linear_to_srgb(torch.from_numpy(light * np.float32(MIDDLE_GRAY / typical)).clamp(0, 1)).numpy()
+    gray, on_object = (
+        _fitted(gray, SHARPNESS_SIDE),
         _fitted(chosen.astype(np.float32), SHARPNESS_SIDE) > 0.5,
     )
     if not on_object.any():
         return 0.0
-    spread = float(grey[on_object].var())
-    return float(cv2.Laplacian(grey, cv2.CV_32F)[on_object].var()) / spread if spread > 0 else 0.0
+    spread = float(gray[on_object].var())
+    return float(cv2.Laplacian(gray, cv2.CV_32F)[on_object].var()) / spread if spread > 0 else 0.0
 
 
 def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], chosen: Bool[np.ndarray, "H W"]) -> float:

@@ -67,15 +67,15 @@ def _plan(
     """Plot cameras as dots with viewing directions, projected along a world axis, with the unit sphere."""
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
-    centres, forward = inspection.placement.centres[:, axes], inspection.placement.axes[:, axes]
-    reach = 1.15 * max(1.0, float(np.abs(centres).max()))
+    centers, forward = inspection.placement.centers[:, axes], inspection.placement.axes[:, axes]
+    reach = 1.15 * max(1.0, float(np.abs(centers).max()))
 
     def place(points: Float64[np.ndarray, "*N 2"]) -> Float64[np.ndarray, "*N 2"]:
         return PLAN / 2 * (1 + points / reach * np.array([1, -1]))
 
     pen.ellipse([*place(np.array([-1.0, 1.0])), *place(np.array([1.0, -1.0]))], outline=PALE_INK)
     for start, end, color in zip(
-        place(centres), place(centres + 0.12 * reach * forward), colors, strict=True
+        place(centers), place(centers + 0.12 * reach * forward), colors, strict=True
     ):
         pen.line([*start, *end], fill=color, width=2)
         pen.ellipse([*(start - 4), *(start + 4)], fill=color)

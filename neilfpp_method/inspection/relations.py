@@ -15,7 +15,7 @@ from neilfpp_method.data.views import project
 
 __all__ = ["CameraPlacement", "camera_placement", "duplicates", "exposure_factors"]
 
-NEIGHBOURS = 6
+NEIGHBORS = 6
 """Number of views, nearest in pose, with which a view is compared."""
 THUMBNAIL = (32, 32)
 """Width and height of the thumbnails that are compared, in pixels."""
@@ -34,7 +34,7 @@ class CameraPlacement:
     """The placement of V cameras around the scene, in the scene frame.
 
     Attributes:
-        centres: centres of the cameras.
+        centers: centres of the cameras.
         axes: unit viewing directions.
         away: cameras that do not show the centre of the scene.
         within: cameras inside the unit sphere, which contains the object.
@@ -42,7 +42,7 @@ class CameraPlacement:
         gap: median angle from a camera to the nearest other camera, seen from the centre, in degrees.
     """
 
-    centres: Float64[np.ndarray, "V 3"]
+    centers: Float64[np.ndarray, "V 3"]
     axes: Float64[np.ndarray, "V 3"]
     away: Bool[np.ndarray, " V"]
     within: Bool[np.ndarray, " V"]
@@ -53,18 +53,18 @@ class CameraPlacement:
 def camera_placement(capture: Capture) -> CameraPlacement:
     """Compute the placement of the cameras of a capture."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.views]
-    centres = np.stack([camera.c2w[:, 3] for camera in cameras])
+    centers = np.stack([camera.c2w[:, 3] for camera in cameras])
     away = []
     for camera in cameras:
         projected = project(camera, torch.zeros(1, 3, dtype=torch.float64))
         inside = (projected.pixel >= 0) & (projected.pixel < torch.tensor([camera.width, camera.height]))
         away.append(not (bool(inside.all()) and float(projected.depth) > 0))
-    distance = np.linalg.norm(centres, axis=1, keepdims=True)
-    directions = centres / distance.clip(1e-9)
+    distance = np.linalg.norm(centers, axis=1, keepdims=True)
+    directions = centers / distance.clip(1e-9)
     cosines = directions @ directions.T
     np.fill_diagonal(cosines, -1.0)
     return CameraPlacement(
-        centres=centres,
+        centers=centers,
         axes=np.stack([camera.w2c[2, :3] for camera in cameras]),
         away=np.array(away),
         within=distance[:, 0] < 1.0,
@@ -95,26 +95,26 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
         A factor per view; 1 if its luminance, or that of all other views, is unknown.
     """
     light = np.array(luminances)
-    scale = max(float(np.median(np.linalg.norm(placement.centres, axis=1))), 1e-9)
-    pose = np.concatenate([placement.centres / scale, placement.axes], axis=1)
+    scale = max(float(np.median(np.linalg.norm(placement.centers, axis=1))), 1e-9)
+    pose = np.concatenate([placement.centers / scale, placement.axes], axis=1)
     nonzero = light > 0
     factors = np.ones(len(light))
     for i in np.flatnonzero(nonzero):
         others = np.flatnonzero(nonzero & (np.arange(len(light)) != i))
         if len(others):
-            nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBOURS]]
+            nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBORS]]
             factors[i] = light[i] / np.median(light[nearest])
     return factors
 
 
-def _grey(picture: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+def _gray(picture: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     """Brightness, clipped at the brightest hundredth of the picture.
 
     A sun or a broken pixel of HDR images would otherwise determine the correlation of all pictures.
     """
-    grey = picture.mean(axis=-1)
-    lit = grey[grey > 0]
-    return np.minimum(grey, np.quantile(lit, LIT)) if lit.size else grey
+    gray = picture.mean(axis=-1)
+    lit = gray[gray > 0]
+    return np.minimum(gray, np.quantile(lit, LIT)) if lit.size else gray
 
 
 def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[int, int], ...]:
@@ -124,7 +124,7 @@ def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[in
     of a single colour are ignored.
     """
     thumbnails = np.stack(
-        [cv2.resize(np.sqrt(_grey(p)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]
+        [cv2.resize(np.sqrt(_gray(p)), THUMBNAIL, interpolation=cv2.INTER_AREA) for p in pictures]
     )
     flat = thumbnails.reshape(len(pictures), -1)
     spread = flat.std(axis=1)

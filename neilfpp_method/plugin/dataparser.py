@@ -59,7 +59,7 @@ class CaptureParser(DataParser):
         views = capture.train_views if split == "train" else capture.test_views or capture.train_views[:1]
         frame = capture.normalisation
         transform = torch.eye(4)[:3]
-        transform[:, 3] = -torch.tensor(frame.centre)
+        transform[:, 3] = -torch.tensor(frame.center)
         return DataparserOutputs(
             image_filenames=[view.image for view in views],
             cameras=_cameras([frame.camera(view.camera) for view in views]),

@@ -19,7 +19,13 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.optimizer import make_optimizer
-from neilfpp_method.train.run import BESIDE_NERFSTUDIO, CaptureSource, create_run, save_checkpoint
+from neilfpp_method.train.run import (
+    BESIDE_NERFSTUDIO,
+    CaptureSource,
+    create_run,
+    last_checkpoint,
+    save_checkpoint,
+)
 
 __all__ = ["RunRecord", "no_record"]
 
@@ -76,4 +82,4 @@ class RunRecord:
         optimizer = make_optimizer(model, self.config.optimizer)
         for theirs in trainer.optimizers.optimizers.values():
             optimizer.state.update(theirs.state)
-        save_checkpoint(self.path / "checkpoints" / "last.pt", model, light_solver, optimizer, steps)
+        save_checkpoint(last_checkpoint(self.path), model, light_solver, optimizer, steps)

@@ -58,7 +58,7 @@ def run_prepare(options: Prepare, console: Console) -> Path:
 
 
 def _prepare(options: Prepare, console: Console) -> Path:
-    posed = any(reader.recognise(options.images) for reader in READERS.values())
+    posed = any(reader.recognize(options.images) for reader in READERS.values())
     capture = load_capture(options.images, response=options.response) if posed else None
     photos = None if posed else survey(options.images, options.response)
     _check_readable(tuple(photos.unreadable.values()) if photos else (), options)

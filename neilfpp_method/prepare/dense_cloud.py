@@ -11,7 +11,7 @@ from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.depth_fusion import fuse
-from neilfpp_method.prepare.plane_sweep import choose_sources, grey_view, inverse_depth_step, sweep
+from neilfpp_method.prepare.plane_sweep import choose_sources, gray_view, inverse_depth_step, sweep
 from neilfpp_method.prepare.progress import Bars
 from neilfpp_method.prepare.sparse_cloud import without_outliers
 
@@ -36,10 +36,10 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
     Raises:
         UserError: no two views are close enough to be compared, or the depth maps agree nowhere.
     """
-    views = [grey_view(view, capture.hdr) for view in capture.views]
+    views = [gray_view(view, capture.hdr) for view in capture.views]
     cameras = [view.camera for view in views]
-    centre = np.array(capture.normalisation.centre)
-    sources = choose_sources(cameras, centre, STEREO_SOURCES)
+    center = np.array(capture.normalisation.center)
+    sources = choose_sources(cameras, center, STEREO_SOURCES)
     if not any(sources):
         raise UserError(f"{capture.root}: no two views see the scene from nearby", "use --cloud sparse")
     bar = open_bar("depth of each view", len(views))
@@ -54,8 +54,8 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
         inverse_depth_step(camera, [cameras[j] for j in others])
         for camera, others in zip(cameras, sources, strict=True)
     ]
-    neighbours = choose_sources(cameras, centre, FUSION_SOURCES)
-    points = fuse(cameras, depths, steps, neighbours, open_bar("fusing depth", len(views)).advance)
+    neighbors = choose_sources(cameras, center, FUSION_SOURCES)
+    points = fuse(cameras, depths, steps, neighbors, open_bar("fusing depth", len(views)).advance)
     if not len(points.position):
         raise UserError(
             f"{capture.root}: the depth maps of the views agree on no surface",

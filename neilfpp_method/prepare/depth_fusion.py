@@ -34,7 +34,7 @@ def fuse(
     cameras: Sequence[Camera],
     depths: Sequence[Float32[np.ndarray, "H W"]],
     steps: Sequence[float],
-    neighbours: Sequence[Sequence[int]],
+    neighbors: Sequence[Sequence[int]],
     advance: Callable[[], None],
 ) -> WorldPoints:
     """Fuse depth maps into the oriented points that at least `MIN_VIEWS` other views confirm.
@@ -48,7 +48,7 @@ def fuse(
         cameras: the pinhole camera of each view.
         depths: depth along the optical axis of each view, world units, 0 if unknown.
         steps: for each view, the difference of inverse depth that its depth map can resolve.
-        neighbours: for each view, the indices of the views that may confirm its depths.
+        neighbors: for each view, the indices of the views that may confirm its depths.
         advance: called after each view, for a progress bar.
 
     Returns:
@@ -56,7 +56,7 @@ def fuse(
     """
     confirmed = [
         _count_confirmations(cameras, depths, i, steps[i], others) >= MIN_VIEWS
-        for i, others in enumerate(neighbours)
+        for i, others in enumerate(neighbors)
     ]
     filtered = [np.where(mask, depth, np.float32(0)) for mask, depth in zip(confirmed, depths, strict=True)]
     maps = [fit_planes(*view) for view in zip(cameras, filtered, steps, strict=True)]
@@ -67,7 +67,7 @@ def fuse(
         position = _unproject(camera, rows, columns, maps[i].depth[rows, columns])
         normal = maps[i].normal[rows, columns].astype(np.float64)
         position_sum, normal_sum, count = position.copy(), normal.copy(), np.ones(len(rows))
-        for j in neighbours[i]:
+        for j in neighbors[i]:
             other = _lookup(cameras[j], maps[j], position, steps[i])
             agrees = other.agrees & ((other.normal * normal).sum(axis=1) >= MIN_COSINE)
             position_sum[agrees] += other.position[agrees]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.capture_folder import FILE, recognise, write_capture
+from neilfpp_method.data.capture_folder import FILE, recognize, write_capture
 from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
@@ -90,7 +90,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
         also=options.also,
         auto=options.auto,
     )
-    if last.result is not None and recognise(options.out):
+    if last.result is not None and recognize(options.out):
         return None
     if step.result is None:
         points = None

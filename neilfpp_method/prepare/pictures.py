@@ -75,8 +75,8 @@ def draw_scene(
         box: centre and radius of the scene's sphere.
     """
     pyramids = np.stack([_pyramid(view.camera, box.scale) for view in views])
-    centre = np.array(box.centre)
-    reach = 1.08 * float(np.abs(pyramids - centre).max(initial=1.2 * box.scale))
+    center = np.array(box.center)
+    reach = 1.08 * float(np.abs(pyramids - center).max(initial=1.2 * box.scale))
     rows = np.random.default_rng(0).permutation(len(points.position))[:MAX_POINTS]
     sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + TITLE), BACKGROUND)
     sides = {"from above": (0, 1, 2), "from the side": (0, 2, 1)}
@@ -86,8 +86,8 @@ def draw_scene(
         order = rows[np.argsort(flip * points.position[rows, depth])]
         panel = Image.new("RGB", (SUPERSAMPLING * PANEL, SUPERSAMPLING * PANEL), BACKGROUND)
         draw = ImageDraw.Draw(panel)
-        project = _Projection(centre[[right, up]], reach, right, up)
-        circle = project(centre) + np.array([[-1.0], [1.0]]) * SUPERSAMPLING * PANEL / 2 * box.scale / reach
+        project = _Projection(center[[right, up]], reach, right, up)
+        circle = project(center) + np.array([[-1.0], [1.0]]) * SUPERSAMPLING * PANEL / 2 * box.scale / reach
         draw.ellipse([*map(float, circle.reshape(-1))], outline=PALE, width=SUPERSAMPLING)
         colors = np.rint(127.5 * (points.normal[order] + 1.0)).astype(np.uint8)
         for (x, y), color in zip(project(points.position[order]), colors, strict=True):
@@ -133,11 +133,11 @@ def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 
 class _Projection:
     """Orthographic projection of world positions to the pixels of a panel, along a world axis."""
 
-    def __init__(self, centre: Float64[np.ndarray, " 2"], reach: float, right: int, up: int) -> None:
-        self._axes, self._centre, self._scale = [right, up], centre, SUPERSAMPLING * PANEL / 2 / reach
+    def __init__(self, center: Float64[np.ndarray, " 2"], reach: float, right: int, up: int) -> None:
+        self._axes, self._center, self._scale = [right, up], center, SUPERSAMPLING * PANEL / 2 / reach
 
     def __call__(self, points: Float64[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 2"]:
-        plane = (points[..., self._axes] - self._centre) * self._scale * np.array([1.0, -1.0])
+        plane = (points[..., self._axes] - self._center) * self._scale * np.array([1.0, -1.0])
         return plane + SUPERSAMPLING * PANEL / 2
 
 

@@ -21,7 +21,7 @@ from neilfpp_method.data.undistort import resample, straight_camera
 from neilfpp_method.data.views import Camera, Normalisation, View
 from neilfpp_method.shading.color import luminance
 
-__all__ = ["GreyView", "choose_sources", "grey_view", "inverse_depth_step", "sweep"]
+__all__ = ["GrayView", "choose_sources", "gray_view", "inverse_depth_step", "sweep"]
 
 MAX_SIDE = 640
 """Longest side of the compared images, in pixels; a larger image is scaled down. Time and memory grow with
@@ -66,19 +66,19 @@ inside or close to the scene's sphere, for which the range would otherwise begin
 
 
 @dataclass(frozen=True)
-class GreyView:
+class GrayView:
     """The image of a view as stereo compares it.
 
     Attributes:
         camera: a pinhole of at most `MAX_SIDE` pixels a side.
-        grey: grey values in [0, 1], of the camera's size.
+        gray: grey values in [0, 1], of the camera's size.
     """
 
     camera: Camera
-    grey: Float32[np.ndarray, "H W"]
+    gray: Float32[np.ndarray, "H W"]
 
 
-def grey_view(view: View, linear: bool) -> GreyView:
+def gray_view(view: View, linear: bool) -> GrayView:
     """Read the image of a view, remove its lens distortion and scale it down to at most `MAX_SIDE` pixels a
     side.
 
@@ -96,12 +96,12 @@ def grey_view(view: View, linear: bool) -> GreyView:
     camera = straight_camera(view.camera)
     if camera is not view.camera:
         color = resample(color, view.camera, camera)
-    grey = luminance(torch.from_numpy(color)).numpy()
-    grey = np.sqrt(grey / max(float(np.quantile(grey, 0.99)), 1e-9)).clip(0.0, 1.0) if linear else grey
+    gray = luminance(torch.from_numpy(color)).numpy()
+    gray = np.sqrt(gray / max(float(np.quantile(gray, 0.99)), 1e-9)).clip(0.0, 1.0) if linear else gray
     scale = min(1.0, MAX_SIDE / max(camera.width, camera.height))
     width, height = round(camera.width * scale), round(camera.height * scale)
     if (width, height) != (camera.width, camera.height):
-        grey = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
         scale_x, scale_y = width / camera.width, height / camera.height
         camera = replace(
             camera,
@@ -112,17 +112,17 @@ def grey_view(view: View, linear: bool) -> GreyView:
             width=width,
             height=height,
         )
-    return GreyView(camera, np.ascontiguousarray(grey, np.float32))
+    return GrayView(camera, np.ascontiguousarray(gray, np.float32))
 
 
 def choose_sources(
-    cameras: Sequence[Camera], centre: Float64[np.ndarray, " 3"], count: int
+    cameras: Sequence[Camera], center: Float64[np.ndarray, " 3"], count: int
 ) -> list[list[int]]:
-    """Choose the source views of each view by the angle between the two cameras as seen from `centre`.
+    """Choose the source views of each view by the angle between the two cameras as seen from `center`.
 
     Args:
         cameras: the cameras of all views, in the world frame.
-        centre: centre of the scene, in the world frame.
+        center: centre of the scene, in the world frame.
         count: largest number of sources per view.
 
     Returns:
@@ -130,7 +130,7 @@ def choose_sources(
         whose ratio to `BEST_ANGLE` is closest to 1. The list of a camera may be empty.
     """
     eyes = np.stack([camera.c2w[:, 3] for camera in cameras])
-    directions = (eyes - centre) / np.linalg.norm(eyes - centre, axis=1, keepdims=True)
+    directions = (eyes - center) / np.linalg.norm(eyes - center, axis=1, keepdims=True)
     angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)))
     cost = np.abs(np.log(np.maximum(angles, 1e-3) / BEST_ANGLE))
     cost[(angles < MIN_ANGLE) | (angles > MAX_ANGLE)] = np.inf
@@ -151,7 +151,7 @@ def inverse_depth_step(camera: Camera, sources: Sequence[Camera]) -> float:
     return 1.0 / (camera.fx * baseline)
 
 
-def sweep(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) -> Float32[np.ndarray, "H W"]:
+def sweep(reference: GrayView, sources: Sequence[GrayView], box: Normalisation) -> Float32[np.ndarray, "H W"]:
     """Compute the depth map of a view by plane-sweep stereo.
 
     The planes are evenly spaced in inverse depth, cover the scene's sphere, and are at most one pixel of
@@ -169,9 +169,9 @@ def sweep(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) 
         score below `MIN_SCORE`, or with the best score at the first or the last plane.
     """
     if not sources:
-        return np.zeros_like(reference.grey)
+        return np.zeros_like(reference.gray)
     inverse_depths = _planes(reference, sources, box)
-    windows = _Windows(reference.grey)
+    windows = _Windows(reference.gray)
     scores = np.stack([_score(reference, sources, windows, float(value)) for value in inverse_depths])
     best = scores.argmax(axis=0)
     inner = np.clip(best, 1, len(inverse_depths) - 2)
@@ -187,10 +187,10 @@ def sweep(reference: GreyView, sources: Sequence[GreyView], box: Normalisation) 
 class _Windows:
     """Means and variances of an image in the window around each pixel."""
 
-    def __init__(self, grey: Float32[np.ndarray, "H W"]) -> None:
-        self.grey = grey
-        self.mean = _window_mean(grey)
-        self.variance = np.maximum(_window_mean(grey * grey) - self.mean**2, 0.0)
+    def __init__(self, gray: Float32[np.ndarray, "H W"]) -> None:
+        self.gray = gray
+        self.mean = _window_mean(gray)
+        self.variance = np.maximum(_window_mean(gray * gray) - self.mean**2, 0.0)
 
     @property
     def textured(self) -> Bool[np.ndarray, "H W"]:
@@ -198,23 +198,23 @@ class _Windows:
 
 
 def _planes(
-    reference: GreyView, sources: Sequence[GreyView], box: Normalisation
+    reference: GrayView, sources: Sequence[GrayView], box: Normalisation
 ) -> Float64[np.ndarray, " D"]:
     """The inverse depths of the planes, from the farthest to the nearest."""
     camera = reference.camera
-    centre_depth = float(camera.w2c[2, :3] @ np.array(box.centre) + camera.w2c[2, 3])
-    far = centre_depth + MARGIN * box.scale
-    near = max(centre_depth - MARGIN * box.scale, MIN_DEPTH_RATIO * far)
+    center_depth = float(camera.w2c[2, :3] @ np.array(box.center) + camera.w2c[2, 3])
+    far = center_depth + MARGIN * box.scale
+    near = max(center_depth - MARGIN * box.scale, MIN_DEPTH_RATIO * far)
     step = inverse_depth_step(camera, [source.camera for source in sources])
     count = int((1 / near - 1 / far) / step)
     return np.linspace(1 / far, 1 / near, min(max(count, MIN_PLANES), MAX_PLANES))
 
 
 def _score(
-    reference: GreyView, sources: Sequence[GreyView], windows: _Windows, inverse_depth: float
+    reference: GrayView, sources: Sequence[GrayView], windows: _Windows, inverse_depth: float
 ) -> Float32[np.ndarray, "H W"]:
     """The mean of the two highest correlations of the reference with its sources warped over a plane."""
-    first = np.full(windows.grey.shape, -1.0, np.float32)
+    first = np.full(windows.gray.shape, -1.0, np.float32)
     second = first.copy()
     for source in sources:
         correlation = _correlation(windows, _Windows(_warp(reference.camera, source, inverse_depth)))
@@ -223,13 +223,13 @@ def _score(
     return 0.5 * (first + second) if len(sources) > 1 else first
 
 
-def _warp(camera: Camera, source: GreyView, inverse_depth: float) -> Float32[np.ndarray, "H W"]:
+def _warp(camera: Camera, source: GrayView, inverse_depth: float) -> Float32[np.ndarray, "H W"]:
     """Warp the image of a source into a camera by the homography of the plane z = 1 / `inverse_depth`."""
     motion = source.camera.w2c @ np.linalg.inv(camera.w2c)
     plane = motion[:3, :3] + np.outer(motion[:3, 3], [0.0, 0.0, inverse_depth])
     homography = _opencv_matrix(source.camera) @ plane @ np.linalg.inv(_opencv_matrix(camera))
     size = (camera.width, camera.height)
-    return cv2.warpPerspective(source.grey, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    return cv2.warpPerspective(source.gray, homography, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
 
 
 def _opencv_matrix(camera: Camera) -> Float64[np.ndarray, "3 3"]:
@@ -239,7 +239,7 @@ def _opencv_matrix(camera: Camera) -> Float64[np.ndarray, "3 3"]:
 
 def _correlation(a: _Windows, b: _Windows) -> Float32[np.ndarray, "H W"]:
     """The normalised cross-correlation of two images in each window."""
-    covariance = _window_mean(a.grey * b.grey) - a.mean * b.mean
+    covariance = _window_mean(a.gray * b.gray) - a.mean * b.mean
     return covariance / np.sqrt(np.maximum(a.variance * b.variance, MIN_VARIANCE**2))
 
 

@@ -13,7 +13,7 @@ from neilfpp_method.data.point_cloud import WorldPoints
 
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]
 
-NEIGHBOURS = 12
+NEIGHBORS = 12
 """Number of nearest neighbours from which normals and outliers are computed."""
 
 MAX_ERROR = 2.0
@@ -58,13 +58,13 @@ class SparsePoints:
 
 def sparse_points(model: pycolmap.Reconstruction) -> SparsePoints:
     """Return all points of a COLMAP model."""
-    centres = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
+    centers = {i: model.image(i).projection_center() for i in model.reg_image_ids()}
     points = list(model.points3D.values())
     position = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
     towards = np.zeros_like(position)
     for i, point in enumerate(points):
         for element in point.track.elements:
-            direction = centres[element.image_id] - point.xyz
+            direction = centers[element.image_id] - point.xyz
             towards[i] += direction / np.linalg.norm(direction)
     return SparsePoints(
         position=position,
@@ -86,7 +86,7 @@ def reliable(points: SparsePoints) -> Bool[np.ndarray, " P"]:
 def oriented(points: SparsePoints) -> WorldPoints:
     """Return the reliable points whose neighbours lie close to a plane, with the normal of that plane."""
     points = points[reliable(points)]
-    if len(points) <= NEIGHBOURS:
+    if len(points) <= NEIGHBORS:
         return WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
     normal, flat = estimate_normals(points.position, points.towards)
     return WorldPoints(points.position[flat], normal[flat])
@@ -106,15 +106,15 @@ def estimate_normals(
     The normal is the direction of the smallest variance of the neighbours.
 
     Args:
-        position: at least `NEIGHBOURS` + 1 points.
+        position: at least `NEIGHBORS` + 1 points.
         towards: for each point a direction; its normal has a non-negative dot product with it.
 
     Returns:
         Unit normals, and for each point whether its neighbours are flat: whether their smallest variance is
         at most a tenth of the next larger one.
     """
-    neighbours = cKDTree(position).query(position, k=NEIGHBOURS + 1)[1]
-    spread = position[neighbours] - position[neighbours].mean(axis=1, keepdims=True)
+    neighbors = cKDTree(position).query(position, k=NEIGHBORS + 1)[1]
+    spread = position[neighbors] - position[neighbors].mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("pki,pkj->pij", spread, spread))
     normal = vectors[:, :, 0]
     normal = normal * np.where((normal * towards).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
@@ -127,9 +127,9 @@ def _not_isolated(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"
     The logarithm of the distance is compared with its median over all points, in standard deviations
     estimated from the median absolute deviation, which outliers do not influence.
     """
-    if len(position) <= NEIGHBOURS:
+    if len(position) <= NEIGHBORS:
         return np.ones(len(position), dtype=bool)
-    distances = cKDTree(position).query(position, k=NEIGHBOURS + 1)[0][:, 1:]
+    distances = cKDTree(position).query(position, k=NEIGHBORS + 1)[0][:, 1:]
     log_distance = np.log(np.maximum(distances.mean(axis=1), 1e-12))
     median = np.median(log_distance)
     deviation = MAD_TO_SIGMA * np.median(np.abs(log_distance - median))

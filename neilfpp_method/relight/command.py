@@ -40,8 +40,9 @@ from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_folder
-from neilfpp_method.train.run import Run, load_run, write_json
+from neilfpp_method.train.run import Run, load_run
 
 __all__ = ["Request", "relight"]
 

@@ -17,7 +17,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.relight.cameras import Shot
 from neilfpp_method.relight.film import Picture
 from neilfpp_method.shading.color import tone_map
-from neilfpp_method.train.run import read_json, write_json
+from neilfpp_method.train.json_files import read_json, write_json
 
 __all__ = ["PictureFolder", "StoredPicture"]
 

@@ -54,7 +54,7 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
     if not isinstance(host, HasSdf):
         raise UserError(
             f"{run.path}: the host of this run has no surface to trace",
-            "relight a run of the VolSDF or mesh host",
+            "use a run of the VolSDF or mesh host",
         )
     mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=device)
     vertices, normals = (

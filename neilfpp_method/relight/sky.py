@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from neilfpp_method.fields.direction_map import cos_edges
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.color import luminance
 
@@ -101,13 +102,10 @@ class Sky:
         planes = self.radiance.permute(2, 0, 1)
         return torch.cat((planes[..., -1:], planes, planes[..., :1]), -1)[None].contiguous()
 
-    @cached_property
+    @property
     def _cos_edges(self) -> Float[Tensor, " E"]:
         """cos θ of the edges between rows, float64."""
-        height = len(self.radiance)
-        edge = torch.arange(height + 1, dtype=torch.float64, device=self.radiance.device)
-        theta = (edge - 0.5).clamp(0, height - 1) / (height - 1) if self.rows_at_poles else edge / height
-        return (math.pi * theta).cos()
+        return cos_edges(len(self.radiance), self.radiance.device, torch.float64, self.rows_at_poles)
 
     @cached_property
     def _mass(self) -> Float[Tensor, "H W"]:

@@ -15,8 +15,9 @@ from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
 from neilfpp_method.settings.types import MeshConfig, NeilfConfig
 from neilfpp_method.train.health_record import read_findings
+from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.quality import QualityCheck, read_checks
-from neilfpp_method.train.run import read_description, read_json
+from neilfpp_method.train.run import read_description
 from neilfpp_method.train.work_record import read_work
 
 __all__ = ["Changed", "Files", "changed_settings", "flat_settings", "read_files"]

@@ -9,7 +9,8 @@ from typing import Any
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
-from neilfpp_method.train.run import read_json
+from neilfpp_method.train.json_files import read_json
+from neilfpp_method.train.run import last_checkpoint
 
 __all__ = ["OWN", "Measured", "is_outdated", "numbers", "read_measured"]
 
@@ -72,7 +73,7 @@ def read_measured(path: Path) -> tuple[dict[str, Measured], list[str]]:
 
 def is_outdated(file: Path, run: Path) -> bool:
     """Whether a file of figures is older than the last checkpoint of its run."""
-    checkpoint = run / "checkpoints" / "last.pt"
+    checkpoint = last_checkpoint(run)
     return checkpoint.is_file() and file.stat().st_mtime < checkpoint.stat().st_mtime
 
 

@@ -21,7 +21,7 @@ from neilfpp_method.report.surface import packed_surface
 from neilfpp_method.report.views import ReportViews, encode_views, run_for_display
 from neilfpp_method.schedule import Stage
 from neilfpp_method.train.light_record import light_summary, read_fits
-from neilfpp_method.train.run import Run, load_run
+from neilfpp_method.train.run import Run, last_checkpoint, load_run
 
 __all__ = ["REPORT", "ReportOptions", "write_report"]
 
@@ -89,7 +89,7 @@ def write_report(
     """
     options.check()
     files = read_files(path)
-    run = load_run(path, device) if (path / "checkpoints" / "last.pt").is_file() else None
+    run = load_run(path, device) if last_checkpoint(path).is_file() else None
     if run is None and not files.has_results:
         raise UserError(f"{path}: nothing to report. {BEFORE_CHECKPOINT}", _how_to_continue(path))
     text = _without_model(files) if run is None else _with_model(run, files, options, on_progress)

@@ -21,7 +21,7 @@ class SceneFacts:
         median_radiance: median linear luminance of the object's pixels; the first render matches it.
         radiance_scale: largest radiance that R can represent.
         background: "none", "constant" or "inverted_sphere".
-        background_color: linear RGB of a constant background, and initial color of an inverted sphere.
+        background_color: linear RGB of a constant background, and initial colour of an inverted sphere.
         far_points: whether points of the scene reach far beyond its box, to walls and trees, so that the
             background has a shape.
         log_gains: natural logarithms of the gains of the training views relative to their mean, as red,

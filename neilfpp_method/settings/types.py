@@ -80,10 +80,10 @@ class OutgoingRadianceConfig:
 
 @dataclass(frozen=True)
 class BrdfConfig:
-    """Network of B: position → base color, roughness, metallic (METHOD §5)."""
+    """Network of B: position → base colour, roughness, metallic (METHOD §5)."""
 
     initial_base_color: float = 0.5
-    """Initial base color. Images hardly separate its scale from the light's, so the mean stays near this."""
+    """Initial base colour. Images hardly separate its scale from the light's, so the mean stays near this."""
     initial_metallic: float = 0.5
     """Initial metallic. A high value makes the first estimate of the light too dark for other surfaces."""
     metals: bool = True
@@ -120,7 +120,7 @@ class MapLightConfig:
     environment_height: int = 32
     """Rows of the environment map; it has twice as many columns. 1: the same radiance from all directions."""
     monochrome: bool = False
-    """Whether the light has a single channel. Lamps are always colored."""
+    """Whether the light has a single channel. Lamps are always coloured."""
     map: str | None = None
     """File of a known environment map (linear EXR, layout in docs/light.md). If not given, the map is
     recovered. Lamps are still recovered if `kind` allows them.
@@ -156,11 +156,11 @@ class BackgroundConfig:
     """Radiance that rays get from beyond the scene sphere."""
 
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
-    """none: R on the scene sphere, which closes the scene. constant: one color. inverted_sphere: a NeRF++
-    field. auto: constant if the image borders show a single color behind the scene, else inverted_sphere.
+    """none: R on the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a NeRF++
+    field. auto: constant if the image borders show a single colour behind the scene, else inverted_sphere.
     """
     color: tuple[float, float, float] | None = None
-    """Linear RGB of a constant background, and initial color of inverted_sphere. If not given, it is taken
+    """Linear RGB of a constant background, and initial colour of inverted_sphere. If not given, it is taken
     from the image borders.
     """
     layers: int = 8
@@ -275,7 +275,7 @@ class LossConfig:
     exposure nor on the camera's response.
     """
     volume: float = 1.0
-    """Weight of L_vol, the error of the volume-rendered color."""
+    """Weight of L_vol, the error of the volume-rendered colour."""
     eikonal: float = 0.1
     """Weight of L_Eik: gradients of G have length 1."""
     hessian: float = 1e-3
@@ -336,7 +336,7 @@ class OptimizerConfig:
     warm_up: int = 0
     """Steps at the start of each stage in which the learning rate rises from a tenth."""
     background_from: float = 0.0
-    """Share of SDF init after which the background field is trained. Before that it is a constant color: a
+    """Share of SDF init after which the background field is trained. Before that it is a constant colour: a
     field that all views see could otherwise explain the object as well.
     """
 

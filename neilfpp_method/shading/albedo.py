@@ -54,7 +54,7 @@ def initial_albedo(base_color: float, metallic: float, lobe: Lobe | None) -> flo
 @lru_cache
 @torch.no_grad()
 def _lobe_integrals(lobe: Lobe, device: torch.device, dtype: torch.dtype) -> Float[Tensor, "1 2 R C"]:
-    """A and B at the centers of the cells of roughness and viewer cosine; cached per device and dtype."""
+    """A and B at the centres of the cells of roughness and viewer cosine; cached per device and dtype."""
     middle = (torch.arange(SIZE) + 0.5) / SIZE
     roughness, cosine = torch.cartesian_prod(middle, middle)[:, :, None].unbind(1)
     up = torch.tensor([0.0, 0.0, 1.0]).expand(len(cosine), 3)

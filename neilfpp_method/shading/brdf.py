@@ -177,7 +177,7 @@ class BrdfValue:
 
 @dataclass(frozen=True)
 class SpecularTerms:
-    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, without the surface's color F0."""
+    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, without the surface's colour F0."""
 
     facing: Float[Tensor, "N S"]
     grazing: Float[Tensor, "N S"]

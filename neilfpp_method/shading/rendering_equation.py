@@ -24,8 +24,8 @@ def shade(
 ) -> Shading:
     """Outgoing radiance L_o(wo) ≈ Σ weight f(wo, wi) L(wi) max(n·wi, 0), in at least float32.
 
-    The colors of the BRDF do not depend on wi and are factored out of the sum: f has three scalar weights per
-    direction, and the only tensors of shape (N, S, 3) that autograd stores are directions and radiance.
+    The colours of the BRDF do not depend on wi and are factored out of the sum: f has three scalar weights
+    per direction, and the only tensors of shape (N, S, 3) that autograd stores are directions and radiance.
 
     Args:
         material: material of the points.

@@ -9,7 +9,7 @@ A ledger attributes every moment to exactly one kind: within `timed("tracing")` 
 "shading" stands still. So its seconds add up to the time since it was made; work that no code has marked is
 "rest".
 
-On a GPU the host clock shows when work is submitted, not when it is done. With `synchronise`, the ledger
+On a GPU the host clock shows when work is submitted, not when it is done. With `synchronize`, the ledger
 waits for the device whenever the kind of work changes, but only in one of `EVERY` steps (a sampled step). The
 time of the other steps of a stage is divided in the proportions of the sampled ones.
 """
@@ -66,22 +66,22 @@ class Ledger:
     """Counts seconds by stage and by kind of work, from its construction on.
 
     Args:
-        synchronise: waits until the device has finished its work; None if calls are synchronous.
+        synchronize: waits until the device has finished its work; None if calls are synchronous.
         now: a clock, in seconds.
     """
 
     def __init__(
         self,
-        synchronise: Callable[[], object] | None = None,
+        synchronize: Callable[[], object] | None = None,
         now: Callable[[], float] = time.perf_counter,
     ) -> None:
         self._seconds: dict[str, dict[str, float]] = {}
         self._unsampled: dict[str, float] = {}
         self._sampled: dict[str, dict[str, float]] = {}
-        self._synchronise, self._now = synchronise, now
+        self._synchronize, self._now = synchronize, now
         self._stage, self._work = PREPARATION, "rest"
         self._in_step = self._apart = False
-        self._samples = synchronise is None
+        self._samples = synchronize is None
         self._since = now()
 
     def add(self, seconds: Mapping[str, Mapping[str, float]]) -> None:
@@ -120,14 +120,14 @@ class Ledger:
         """Mark a training step, by its number in the stage."""
         self._count()
         self._in_step = True
-        self._samples = self._synchronise is None or number % EVERY == FIRST
+        self._samples = self._synchronize is None or number % EVERY == FIRST
         self._wait()
         try:
             yield
         finally:
             self._wait()
             self._count()
-            self._in_step, self._samples = False, self._synchronise is None
+            self._in_step, self._samples = False, self._synchronize is None
 
     def begin(self, work: Work, apart: bool) -> tuple[Work, bool]:
         """Begin another kind of work; see `timed`. Returns the previous kind, for `restore`."""
@@ -149,8 +149,8 @@ class Ledger:
         self._work, self._apart = before
 
     def _wait(self, always: bool = False) -> None:
-        if self._synchronise is not None and (always or self._samples):
-            self._synchronise()
+        if self._synchronize is not None and (always or self._samples):
+            self._synchronize()
 
     def _count(self) -> None:
         """Attribute the time since the last call to the current kind of work."""
@@ -160,7 +160,7 @@ class Ledger:
             self._unsampled[self._stage] = self._unsampled.get(self._stage, 0.0) + passed
             return
         targets = [self._seconds]
-        if self._in_step and not self._apart and self._synchronise is not None:
+        if self._in_step and not self._apart and self._synchronize is not None:
             targets.append(self._sampled)
         for seconds in targets:
             parts = seconds.setdefault(self._stage, {})

@@ -12,8 +12,8 @@ from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.images import replacing
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.frontier import FIGURES, Measured, frontier
+from neilfpp_method.train.environment import environment
 from neilfpp_method.train.json_files import write_json
-from neilfpp_method.train.run import environment
 
 __all__ = ["write_tradeoff"]
 

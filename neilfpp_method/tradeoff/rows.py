@@ -26,6 +26,7 @@ from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.pace import with_steps
 from neilfpp_method.train.quality import read_checks
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
 __all__ = ["Row", "check_same", "measured", "rows_of", "run_row"]
@@ -128,20 +129,16 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
     exists = (row.out / "config.json").is_file()
     plan = read_budget(row.out) if exists else None
     if plan is None or plan.took is None:
-        run_training(
+        request = TrainingRequest(
             data=None if exists else row.data,
             out=row.out,
             config=None if exists else row.config,
             resume=exists,
-            test_every=None,
-            response="auto",
-            device=row.device,
-            devices=1,
-            console=console,
             effects=None if exists else parse_effects(row.effects),
             budget=row.budget,
-            at_end=at_end,
+            device=row.device,
         )
+        run_training(request, console, at_end)
     if not _has_metrics(row.out):
         run = at_size(load_run(row.out, pick_device(row.device)), None, None)
         if run.capture.test_views:

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-
-import torch
 
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
-from neilfpp_method.data.capture import Capture
 from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.plan import Decision, Plan
-from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train.budget_record import BudgetPlan, Revision, write_budget
 from neilfpp_method.train.pace import with_steps
 from neilfpp_method.train.quality import QualityCheck
-from neilfpp_method.train.trial import Trial, run_trial
-from neilfpp_method.train.work_record import waiting
+from neilfpp_method.train.trial import Trial, TrialLimits, Workload, run_trial
 
-__all__ = ["close_budget", "outcome", "plan_budget", "planned_effects", "planned_settings"]
+__all__ = ["close_budget", "outcome", "plan_budget", "plan_summary", "planned_effects", "planned_settings"]
 
 TRIAL_SHARE = 0.03
 """Share of the budget that the steps of a trial may take."""
@@ -40,45 +35,26 @@ LONG_TAILS = "long-tails"
 """The effect that is decided together with the initial light."""
 
 
-def plan_budget(
-    budget: float,
-    capture: Capture,
-    config: NeilfConfig,
-    request: EffectRequest,
-    device: torch.device,
-    devices: int,
-    ledger: Ledger,
-    report: bool,
-    say: Callable[[str], object],
-) -> BudgetPlan:
+def plan_budget(budget: float, work: Workload, ledger: Ledger) -> BudgetPlan:
     """Measure the costs of a training in a trial, and plan its steps for a time budget.
 
     Args:
         budget: time of the whole command, in seconds.
-        capture: the capture, with views of the size of their files.
-        config: the settings; the steps of its stages are used as proportions.
-        request: the value of `--effects`.
-        device: the device of the training.
-        devices: number of processes of the training, which must be 1.
+        work: the training, with views of the size of their files; the steps of its stages are used as
+            proportions.
         ledger: the clock; time that has already passed is part of the budget.
-        report: whether the command ends by writing the report.
-        say: prints a line for the user.
 
     Raises:
-        UserError: if the budget is too small (the message names the smallest usable budget), or if there is
-            more than one process.
+        UserError: if the budget is too small; the message names the smallest usable budget.
     """
-    if devices > 1:
-        raise UserError("--budget plans for one process", "leave --devices and --nodes out")
-    wait = waiting(device) or (lambda: None)
+    limits = TrialLimits(
+        steps=min(TRIAL_SHARE * budget, MAX_TRIAL), places=PLACES_SHARE * budget, light=LIGHT_SHARE * budget
+    )
     trials: dict[Size, Trial] = {}
 
     def share(size: Size) -> float:
         if size not in trials:
-            limit = min(TRIAL_SHARE * budget, MAX_TRIAL)
-            changed = sized(config, size)
-            places, light = PLACES_SHARE * budget, LIGHT_SHARE * budget
-            trials[size] = run_trial(capture, changed, request, device, limit, places, light, report, wait)
+            trials[size] = run_trial(replace(work, config=sized(work.config, size)), limits)
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
@@ -97,7 +73,6 @@ def plan_budget(
         )
     plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, affordable)))
-    say(_plan_summary(plan))
     return plan
 
 
@@ -118,7 +93,7 @@ def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
         effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
-def _plan_summary(plan: BudgetPlan) -> str:
+def plan_summary(plan: BudgetPlan) -> str:
     """One line for the console, before the training."""
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
     return (

@@ -25,8 +25,9 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
+from neilfpp_method.train.optimizer import seed_step
 
-__all__ = ["build_model", "cloud_summary", "exposures_of", "scene_facts", "show_known_light"]
+__all__ = ["build_model", "cloud_summary", "exposures_of", "initial_model", "scene_facts", "show_known_light"]
 
 LDR_SCALE = 1.0
 """Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
@@ -43,7 +44,7 @@ BRIGHT_QUANTILE = 0.999
 """R also reaches this quantile of the radiance of HDR images. The brightest pixels are excluded because a
 single lamp in view should not set the scale of R.
 """
-SEEN_EVERY = 67
+VISIBILITY_STRIDE = 67
 """One in this many pixels of every view is traced to check that the cameras see the outside of a mesh."""
 
 
@@ -101,6 +102,18 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
     return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
 
 
+def initial_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
+    """Build the model with which a training starts: random weights of the seed, and the known light if any.
+
+    Raises:
+        UserError: see `build_model` and `show_known_light`.
+    """
+    seed_step(config.train.seed, step=-1)
+    model = build_model(capture, facts, config)
+    show_known_light(model)
+    return model
+
+
 def show_known_light(model: NeilfModel) -> None:
     """Load the known environment map into a new model if the settings name one.
 
@@ -114,10 +127,9 @@ def show_known_light(model: NeilfModel) -> None:
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
-    scale, start, points = facts.radiance_scale, facts.median_radiance, _points(capture, config)
     poses = [capture.normalisation.camera(view.camera).c2w for view in capture.train_views]
     cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
-    return VolSdfHost(config, scale, facts.background, facts.background_color, points, start, cameras)
+    return VolSdfHost(config, facts, _cloud_points(capture, config), cameras)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
@@ -127,8 +139,7 @@ def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
         raise UserError(
             f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH"
         )
-    scale, start = facts.radiance_scale, facts.median_radiance
-    host = MeshHost(mesh, config, scale, facts.background, facts.background_color, start)
+    host = MeshHost(mesh, config, facts)
     _check_visible(host, capture, path or "inputs/model/mesh.ply")
     return host
 
@@ -152,7 +163,7 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-    outside = torch.cat([host.cross(camera_rays(camera)[::SEEN_EVERY]).outside for camera in cameras])
+    outside = torch.cat([host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]).outside for camera in cameras])
     if not len(outside):
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
@@ -161,7 +172,7 @@ def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
         )
 
 
-def _points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
+def _cloud_points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
     if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
     points = load_point_cloud(capture.point_cloud, capture.normalisation)

@@ -21,7 +21,7 @@ from torch.utils._pytree import tree_leaves
 __all__ = ["Origin", "OriginsOfNotFinite", "is_finite"]
 
 PACKAGE = Path(__file__).parents[1]
-UNINITIALISED = ("empty", "new_empty", "resize")
+UNINITIALIZED = ("empty", "new_empty", "resize")
 """Prefixes of the names of operations that return uninitialised memory."""
 
 
@@ -81,9 +81,9 @@ class OriginsOfNotFinite(TorchDispatchMode):
         broken = [_memory(value) for value in _tensors((args, kwargs)) if not is_finite(value)]
         sources = [self._origins[memory] for memory in broken if memory in self._origins]
         result = func(*args, **(kwargs or {}))
-        uninitialised = func.__name__.startswith(UNINITIALISED)
+        uninitialized = func.__name__.startswith(UNINITIALIZED)
         for value in _tensors(result):
-            if uninitialised:
+            if uninitialized:
                 self._origins.pop(_memory(value), None)
             elif is_finite(value):
                 continue

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Finding, Health
 from neilfpp_method.health.watch import FILE, FORMAT, Watch
-from neilfpp_method.settings.plain import from_dict
-from neilfpp_method.train.run import read_json, write_json
+from neilfpp_method.train.json_files import read_entries, write_json
 
 __all__ = ["health_summary", "read_findings", "write_findings"]
 
@@ -27,20 +25,7 @@ def read_findings(run: Path) -> list[Finding] | None:
     Raises:
         UserError: if the file is damaged or of another version.
     """
-    path = run / FILE
-    if not path.is_file():
-        return None
-    stored = read_json(path)
-    if stored.get("format") != FORMAT or not isinstance(stored.get("findings"), list):
-        raise UserError(
-            f"{path}: a record of another version", "remove the file, or use the version that wrote it"
-        )
-    try:
-        return [from_dict(Finding, finding, str(path)) for finding in stored["findings"]]
-    except (TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path}: not a complete record ({error})", "remove the file, or train again"
-        ) from error
+    return read_entries(run / FILE, FORMAT, "findings", Finding)
 
 
 def health_summary(findings: list[Finding]) -> str:

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.fit import MIN_POINTS, Evidence
-from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
-from neilfpp_method.train.run import read_json, write_json
+from neilfpp_method.train.json_files import read_entries, write_json
 
 __all__ = ["LightFit", "light_summary", "note_fit", "read_fits", "write_fits"]
 
@@ -56,21 +54,7 @@ def read_fits(run: Path, before: int) -> list[LightFit]:
     Raises:
         UserError: if the file is damaged or of another version.
     """
-    path = run / FILE
-    if not path.is_file():
-        return []
-    stored = read_json(path)
-    if stored.get("format") != FORMAT or not isinstance(stored.get("fits"), list):
-        raise UserError(
-            f"{path}: a record of another version", "remove the file, or use the version that wrote it"
-        )
-    try:
-        fits = [from_dict(LightFit, fit, str(path)) for fit in stored["fits"]]
-    except (TypeError, AttributeError) as error:
-        # A key is missing, or a value is not an object.
-        raise UserError(
-            f"{path}: not a complete record ({error})", "remove the file, or train again"
-        ) from error
+    fits = read_entries(run / FILE, FORMAT, "fits", LightFit) or []
     return [fit for fit in fits if fit.step < before]
 
 

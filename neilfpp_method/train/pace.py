@@ -37,12 +37,12 @@ class Pace:
     Attributes:
         plan: the plan, to which revisions are added.
         ledger: the clock.
-        revised: time of the last revision, in seconds.
+        revised_at: time of the last revision, in seconds.
     """
 
     plan: BudgetPlan
     ledger: Ledger
-    revised: float = 0.0
+    revised_at: float = 0.0
 
     def revise(self, config: TrainConfig, position: StagePosition, step: int) -> TrainConfig:
         """Plan the remaining steps again if it is time to do so.
@@ -56,9 +56,9 @@ class Pace:
             The settings with the new steps; `config` itself if nothing has changed.
         """
         now = self.ledger.total
-        if now - self.revised < EVERY * self.plan.budget or position.step >= position.length:
+        if now - self.revised_at < EVERY * self.plan.budget or position.step >= position.length:
             return config
-        self.revised = now
+        self.revised_at = now
         stage = position.stage.value
         parts = self.ledger.seconds().get(stage, {})
         fitting = parts.get("light_fits", 0.0)

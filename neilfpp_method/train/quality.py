@@ -23,10 +23,9 @@ from torch import Tensor
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePosition
-from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import PixelBatch
-from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
+from neilfpp_method.train.json_files import is_finite_number, read_entries, write_json
 
 __all__ = ["FILE", "Quality", "QualityCheck", "has_checks", "read_checks", "write_checks"]
 
@@ -148,20 +147,7 @@ def read_checks(run: Path, before: int | None = None) -> Sequence[QualityCheck]:
         UserError: if the file is damaged or of another version.
     """
     path = run / FILE
-    if not path.is_file():
-        return []
-    stored = read_json(path)
-    if stored.get("format") != FORMAT or not isinstance(stored.get("checks"), list):
-        raise UserError(
-            f"{path}: a record of another version", "remove the file, or use the version that wrote it"
-        )
-    try:
-        checks = [from_dict(QualityCheck, check, str(path)) for check in stored["checks"]]
-    except (TypeError, AttributeError) as error:
-        # A key is missing, or a value is not an object.
-        raise UserError(
-            f"{path}: not a complete record ({error})", "remove the file, or train again"
-        ) from error
+    checks = read_entries(path, FORMAT, "checks", QualityCheck) or []
     if not all(
         is_finite_number(n)
         for check in checks

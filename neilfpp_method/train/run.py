@@ -21,13 +21,9 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import platform
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -45,6 +41,7 @@ from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.effects_record import read_plan
+from neilfpp_method.train.environment import environment
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.lock import LOCK
 from neilfpp_method.train.output import check_folder
@@ -57,15 +54,14 @@ __all__ = [
     "Run",
     "check_free",
     "create_run",
+    "last_checkpoint",
     "load_checkpoint",
     "load_run",
     "load_weights",
     "read_description",
-    "read_json",
     "rewrite_training",
     "run_folder",
     "save_checkpoint",
-    "write_json",
 ]
 
 FORMAT = 2
@@ -78,17 +74,6 @@ DESCRIBING = ("capture.json", "scene.json", "environment.json")
 """Files that are written before `config.json`; a folder is a run once it contains `config.json`."""
 HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
 """Temporary names of these files while `replacing` writes them."""
-PACKAGES = (
-    "neilfpp-method",
-    "torch",
-    "lightning-fabric",
-    "numpy",
-    "opencv-contrib-python-headless",
-    "OpenEXR",
-    "trimesh",
-    "scikit-image",
-)
-"""Packages whose versions are recorded."""
 CHECKPOINT_KEYS = {"format", "step", "model", "light_solver", "optimizer"}
 """Keys of a checkpoint."""
 
@@ -193,11 +178,11 @@ def check_free(path: Path) -> None:
         UserError: if the folder contains other files, or cannot be created.
     """
     check_folder(path)
-    if path.exists() and any(not _of_no_run(inner.name) for inner in path.iterdir()):
+    if path.exists() and any(not _is_leftover(inner.name) for inner in path.iterdir()):
         raise UserError(f"{path}: exists already", "choose another --out, or continue it with --resume")
 
 
-def _of_no_run(name: str) -> bool:
+def _is_leftover(name: str) -> bool:
     """Whether a file is left over from a training that was killed before the run existed."""
     return name in (PIXELS, LOCK, *DESCRIBING) or bool(HALF_WRITTEN.fullmatch(name))
 
@@ -253,7 +238,13 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
 
 @dataclass(frozen=True)
 class Description:
-    """The settings, the capture and the measured facts of a run."""
+    """What describes a run before its training.
+
+    Attributes:
+        config: the settings, before any decision on effects.
+        source: location of the capture, and how it is read.
+        facts: facts that were measured in the images.
+    """
 
     config: NeilfConfig
     source: CaptureSource
@@ -279,16 +270,16 @@ def read_description(path: Path) -> Description:
             "use the version of neilfpp that wrote it, or train again",
         )
     return Description(
-        _described(NeilfConfig, stored.get("config"), f"{path / 'config.json'}: config"),
-        _described(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json")),
-        _described(SceneFacts, read_json(path / "scene.json"), str(path / "scene.json")),
+        _parse(NeilfConfig, stored.get("config"), f"{path / 'config.json'}: config"),
+        _parse(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json")),
+        _parse(SceneFacts, read_json(path / "scene.json"), str(path / "scene.json")),
     )
 
 
 Part = TypeVar("Part")
 
 
-def _described(kind: type[Part], values: Any, where: str) -> Part:
+def _parse(kind: type[Part], values: Any, where: str) -> Part:
     try:
         return from_dict(kind, values, where)
     except (TypeError, AttributeError) as error:
@@ -299,6 +290,11 @@ def _described(kind: type[Part], values: Any, where: str) -> Part:
 
 
 # ------------------------------------------------------------------------------------------------ checkpoints
+
+
+def last_checkpoint(run: Path) -> Path:
+    """The file of the newest checkpoint of a run, from which it continues."""
+    return run / "checkpoints" / "last.pt"
 
 
 def save_checkpoint(
@@ -351,37 +347,3 @@ def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> No
             f"{run}: the checkpoint does not fit the settings in config.json",
             "restore that file, or use the version of neilfpp that wrote the run",
         ) from error
-
-
-# ------------------------------------------------------------------------------------------------------ files
-
-
-def environment() -> dict[str, Any]:
-    """Command line, versions and hardware, for the record of a run."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = "not installed as a package"
-    gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
-    return {
-        "command": sys.argv,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "gpus": gpus,
-        "packages": versions,
-    }
-
-
-def _processor() -> str:
-    """Model name of the processor."""
-    information = Path("/proc/cpuinfo")
-    if information.is_file():
-        for line in information.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()

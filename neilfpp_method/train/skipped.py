@@ -37,13 +37,13 @@ class Moment:
         batch: the pixels of the step.
         position: the stage and the position within it.
         random: state of torch's random number generator on the CPU.
-        remembered: state of the replay buffer (`lighting.replay`), which the step changes.
+        replay: state of the replay buffer (`lighting.replay`), which the step changes.
     """
 
     batch: PixelBatch
     position: StagePosition
     random: Tensor
-    remembered: dict[str, Any]
+    replay: dict[str, Any]
 
     @staticmethod
     def before_step(model: NeilfModel, batch: PixelBatch, position: StagePosition) -> Moment:
@@ -51,11 +51,11 @@ class Moment:
 
         The replay buffer, some hundred kilobytes, is copied if the step uses it.
         """
-        remembered = {}
+        replay = {}
         if not model.stages[position.stage].moves_host:
             state = model.replay.state_dict(prefix="replay.")
-            remembered = {name: v.clone() if isinstance(v, Tensor) else dict(v) for name, v in state.items()}
-        return Moment(batch, position, torch.get_rng_state(), remembered)
+            replay = {name: v.clone() if isinstance(v, Tensor) else dict(v) for name, v in state.items()}
+        return Moment(batch, position, torch.get_rng_state(), replay)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def keep_step(run: Path, model: NeilfModel, moment: Moment, step: int) -> Path |
         "stage": moment.position.stage.value,
         "share": moment.position.share,
         "batch": {f.name: getattr(moment.batch, f.name).cpu() for f in dataclasses.fields(PixelBatch)},
-        "model": {**model.state_dict(), **moment.remembered},
+        "model": {**model.state_dict(), **moment.replay},
         "random": moment.random,
     }
     path = folder / f"{step}.pt"

@@ -9,16 +9,17 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from neilfpp_method.errors import Stopped
+from neilfpp_method.train.request import TrainingRequest
 
 __all__ = ["continue_command", "stop_request"]
 
 
-def continue_command(command: str, out: Path, device: str, devices: int, nodes: int) -> str:
+def continue_command(request: TrainingRequest, out: Path) -> str:
     """The command line that continues a stopped run."""
-    options = ["--device", device] if device != "auto" else []
-    options += ["--devices", str(devices)] if devices != 1 else []
-    options += ["--nodes", str(nodes)] if nodes != 1 else []
-    return f"{command} {shlex.join(['--out', str(out), '--resume', *options])}"
+    options = ["--device", request.device] if request.device != "auto" else []
+    options += ["--devices", str(request.devices)] if request.devices != 1 else []
+    options += ["--nodes", str(request.nodes)] if request.nodes != 1 else []
+    return f"{request.command} {shlex.join(['--out', str(out), '--resume', *options])}"
 
 
 @contextmanager

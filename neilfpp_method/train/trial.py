@@ -9,7 +9,7 @@ final geometry; the plan is therefore revised from measured times (`budget.plan`
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -18,6 +18,7 @@ from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
+from neilfpp_method.data.views import View
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.material_search import SEARCH_AT, SEARCH_SHARE
@@ -37,11 +38,12 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, active_losses, stage_steps, weigh
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.train.build import build_model, scene_facts, show_known_light
+from neilfpp_method.train.build import initial_model, scene_facts
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.preview import preview_pixels
+from neilfpp_method.train.work_record import waiting
 
-__all__ = ["Trial", "run_trial"]
+__all__ = ["Trial", "TrialLimits", "Workload", "run_trial"]
 
 VIEWS = 4
 """Number of training views that a trial reads."""
@@ -74,6 +76,42 @@ the report's views; the rest is for the surface of the report.
 
 
 @dataclass(frozen=True)
+class Workload:
+    """A training whose costs are wanted.
+
+    Attributes:
+        capture: the capture.
+        config: the settings.
+        effects: the value of `--effects`.
+        device: the device of the training.
+        report: whether the command ends by writing the report.
+    """
+
+    capture: Capture
+    config: NeilfConfig
+    effects: EffectRequest
+    device: torch.device
+    report: bool
+
+
+@dataclass(frozen=True)
+class TrialLimits:
+    """Times, in seconds.
+
+    Attributes:
+        steps: approximate time that the steps of all stages of the trial may take together.
+        places: maximum time of the measurements at places in the training. If they would take more they are
+            left out.
+        light: maximum time of the search for the initial light in the training. It determines the number of
+            pixels of the search.
+    """
+
+    steps: float
+    places: float
+    light: float
+
+
+@dataclass(frozen=True)
 class Trial:
     """The result of a trial.
 
@@ -89,144 +127,199 @@ class Trial:
     light_pixels: int | None
 
 
+@dataclass(frozen=True)
+class _Setup:
+    """The model that a trial trains, and what it is trained on.
+
+    Attributes:
+        capture: some views of the capture, at a reduced size.
+        pixels: the training pixels of these views.
+        config: the settings of the training, from which a trial differs as `trial_config` says.
+        trial_config: the settings of the trial: more rays are shaded, and fits of the light are small.
+        plan: the effects of the training.
+        model: the model, on the device of the training.
+        solver: its light solver.
+        optimizer: its optimizer.
+        wait: returns when the device has finished its work.
+    """
+
+    capture: Capture
+    pixels: PixelDataset
+    config: NeilfConfig
+    trial_config: NeilfConfig
+    plan: Plan
+    model: NeilfModel
+    solver: LightSolver
+    optimizer: torch.optim.Optimizer
+    wait: Callable[[], object]
+
+    def seconds(self, work: Callable[[], object]) -> float:
+        """Time of a function call including its work on the device."""
+        began = time.perf_counter()
+        work()
+        self.wait()
+        return time.perf_counter() - began
+
+
 @dataclass
-class _Seconds:
-    """Times of the steps and of the fits of a stage."""
+class _StageTimes:
+    """Times measured in a stage, in seconds: each step, each fit, and the picture and the health check at its
+    end.
+    """
 
     steps: list[float] = field(default_factory=list)
     fits: list[float] = field(default_factory=list)
+    picture: float = 0.0
+    health_check: float = 0.0
 
 
-def run_trial(
-    capture: Capture,
-    config: NeilfConfig,
-    request: EffectRequest,
-    device: torch.device,
-    limit: float,
-    most_for_places: float,
-    most_for_light: float,
-    report: bool,
-    wait: Callable[[], object] = lambda: None,
-) -> Trial:
+@dataclass(frozen=True)
+class _Search:
+    """The search for the initial light.
+
+    Attributes:
+        pixels: number of pixels; None if the training does not search, 0 if there is too little time.
+        seconds: time of the search.
+    """
+
+    pixels: int | None = None
+    seconds: float = 0.0
+
+
+def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     """Measure the costs of a training.
 
     Args:
-        capture: the capture. Large views are read at a smaller size, which does not affect the time of a
-            step.
-        config: the settings; the steps of its stages are used as proportions.
-        request: the value of `--effects`.
-        device: the device of the training.
-        limit: approximate time that the steps of all stages may take together, in seconds.
-        most_for_places: maximum time of the measurements at places, in seconds. If they would take more they
-            are left out.
-        most_for_light: maximum time of the search for the initial light, in seconds. It determines the number
-            of pixels of the search.
-        report: whether the command ends by writing the report.
-        wait: returns when the device has finished its work.
+        work: the training. Large views are read at a smaller size, which does not affect the time of a step.
+            The steps of the stages are used as proportions.
+        limits: how long the trial, and parts of the training, may take.
     """
-    small = replace(capture, views=_some(capture))
+    setup = _set_up(work)
+    lengths = {stage: steps for stage, steps in stage_steps(setup.config.train).items() if steps}
+    with_material = [stage for stage in lengths if setup.model.stages[stage].moves_material]
+    places = _seconds_of_places(setup)
+    if places * len(with_material) > limits.places:
+        places = 0.0
+    search = _plan_search(setup, len(work.capture.train_views), limits.light) if with_material else _Search()
+    surface = setup.seconds(lambda: _review_surface(setup.plan, setup.model, setup.pixels))
+    costs, times = {}, _StageTimes()
+    for stage, steps in lengths.items():
+        times = _measure_stage(setup, stage, limits.steps / len(lengths))
+        fit = _fit_seconds(setup, times.fits[-1:]) / _steps_per_fit(setup.config)
+        searches = len(SEARCH_AT) * SEARCH_SHARE * search.seconds if stage is Stage.MATERIAL_INIT else 0.0
+        cost = StageCost(
+            steps,
+            step=sum(times.steps) / len(times.steps),
+            fit=fit + searches / steps,
+            end=times.picture + 2 * times.health_check,
+        )
+        if stage in with_material:
+            cost = replace(cost, start=surface + places)
+        if with_material and stage is with_material[0]:
+            first_fit = _fit_seconds(setup, times.fits[:1])
+            # The search for the initial light ends with the solver's first fit. Without the search, the first
+            # fit is made within the stage.
+            if search.pixels:
+                cost = replace(cost, start=cost.start + (search.seconds + first_fit))
+            else:
+                cost = replace(cost, first_fit=first_fit)
+        costs[stage.value] = cost
+    report = REPORT * times.picture if work.report else 0.0
+    return Trial(Costs(costs, report), places * len(with_material), search.pixels)
+
+
+def _set_up(work: Workload) -> _Setup:
+    small = replace(work.capture, views=_some(work.capture))
     small = at_scale(small, scale_for_pixels(small.views, PIXELS_OF_A_VIEW * len(small.views)))
-    pixels = PixelDataset(small, small.train_views, device)
-    plan = Plan.begin(request, config)
-    facts = scene_facts(small, pixels, config)
+    pixels = PixelDataset(small, small.train_views, work.device)
+    plan = Plan.begin(work.effects, work.config)
+    facts = scene_facts(small, pixels, work.config)
     record_facts(plan, facts)
     config = plan.config_of_model
-    trial_config, fit_scale = changed(config, {"shading.hit_share": TRIAL_HIT_SHARE}), 1.0
+    trial_config = changed(config, {"shading.hit_share": TRIAL_HIT_SHARE})
     if config.light.kind != "free":
         points = max(1, config.light.fit.points // FIT_PART)
         trial_config = changed(trial_config, {"light.fit.every": FIT_EVERY, "light.fit.points": points})
-        fit_scale = config.light.fit.points / points
-    seed_step(config.train.seed, step=-1)
-    model = build_model(small, facts, trial_config).to(device).train()
-    show_known_light(model)
-    solver = model.light_solver().to(device)
+    model = initial_model(small, facts, trial_config).to(work.device).train()
+    solver = model.light_solver().to(work.device)
     optimizer = make_optimizer(model, config.optimizer)
-
-    lengths = {stage: steps for stage, steps in stage_steps(config.train).items() if steps}
-    measures_places = model.lobe is not None and any(plan.is_open(name) for name in JUDGED)
-    place_seconds = seconds_of_evidence(device) if measures_places else 0.0
-    with_material = [stage for stage in lengths if model.stages[stage].moves_material]
-    if place_seconds * len(with_material) > most_for_places:
-        place_seconds = 0.0
-    light_pixels, light = None, 0.0
-    if solver.seeks_start and len(capture.train_views) >= MIN_TRAIN_VIEWS and with_material:
-        rate = seconds_of_pixel(device, plan.is_open("long-tails"), plan.is_open("metals"))
-        light_pixels = min(MAX_PIXELS, int(most_for_light / rate))
-        light_pixels = 0 if light_pixels < MIN_PIXELS else light_pixels
-        light = rate * light_pixels
-    surface = _timed(lambda: _review_surface(plan, model, pixels), wait)
-    costs, picture, fitted = {}, 0.0, False
-    for stage, steps in lengths.items():
-        moves = model.stages[stage].moves_material
-        seconds = _steps(model, solver, optimizer, pixels, trial_config, stage, limit / len(lengths), wait)
-        model.eval()
-        picture = _picture_seconds(model, small, pixels, moves, wait)
-        sample = pixels.sample(CHECKED_PIXELS, gradients=False)
-        health_check = _timed(lambda sample=sample, moves=moves: measure_surface(model, sample, moves), wait)
-        model.train()
-        first, later = (seconds.fits[:1] or [0.0])[0], (seconds.fits[-1:] or [0.0])[0]
-        every = 1 if config.light.kind == "free" else config.light.fit.every
-        step = sum(seconds.steps) / len(seconds.steps)
-        begins = moves and not fitted
-        # The search for the initial light ends with the solver's first fit. Without the search, the first fit
-        # is made within the stage.
-        first_fit = fit_scale * first if begins else 0.0
-        before = (light + first_fit if light_pixels else 0.0) if begins else 0.0
-        searches = len(SEARCH_AT) * SEARCH_SHARE * light if stage is Stage.MATERIAL_INIT else 0.0
-        costs[stage.value] = StageCost(
-            steps,
-            step,
-            fit=fit_scale * later / every + searches / steps,
-            start=(surface + place_seconds if moves else 0.0) + before,
-            end=picture + 2 * health_check,
-            first_fit=0.0 if light_pixels else first_fit,
-        )
-        fitted = fitted or moves
-    places = place_seconds * len(with_material)
-    return Trial(Costs(costs, REPORT * picture if report else 0.0), places, light_pixels)
+    wait = waiting(work.device) or (lambda: None)
+    return _Setup(small, pixels, config, trial_config, plan, model, solver, optimizer, wait)
 
 
-def _some(capture: Capture) -> tuple:
+def _some(capture: Capture) -> tuple[View, ...]:
     """The first test view, for the preview, and about `VIEWS` evenly spaced training views."""
     views = capture.train_views
     return (*capture.test_views[:1], *views[:: -(-len(views) // VIEWS)])
 
 
-def _steps(
-    model: NeilfModel,
-    solver: LightSolver,
-    optimizer: torch.optim.Optimizer,
-    pixels: PixelDataset,
-    config: NeilfConfig,
-    stage: Stage,
-    limit: float,
-    wait: Callable[[], object],
-) -> _Seconds:
+def _seconds_of_places(setup: _Setup) -> float:
+    """Time of the measurements at places before a stage, in seconds; 0 if no effect needs them."""
+    needed = setup.model.lobe is not None and any(setup.plan.is_open(name) for name in JUDGED)
+    return seconds_of_evidence(setup.pixels.device) if needed else 0.0
+
+
+def _plan_search(setup: _Setup, views: int, limit: float) -> _Search:
+    """Fit the search for the initial light of a training on so many views into a time limit in seconds."""
+    if not setup.solver.seeks_start or views < MIN_TRAIN_VIEWS:
+        return _Search()
+    plan = setup.plan
+    rate = seconds_of_pixel(setup.pixels.device, plan.is_open("long-tails"), plan.is_open("metals"))
+    pixels = min(MAX_PIXELS, int(limit / rate))
+    pixels = 0 if pixels < MIN_PIXELS else pixels
+    return _Search(pixels, rate * pixels)
+
+
+def _fit_seconds(setup: _Setup, measured: Sequence[float]) -> float:
+    """Time of a fit in the training, from the fit that a trial measured, if any."""
+    if not measured or setup.config.light.kind == "free":
+        return 0.0
+    return measured[0] * setup.config.light.fit.points / setup.trial_config.light.fit.points
+
+
+def _steps_per_fit(config: NeilfConfig) -> int:
+    return 1 if config.light.kind == "free" else config.light.fit.every
+
+
+def _measure_stage(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
+    """Time the steps of a stage for about `limit` seconds, and its picture and health check."""
+    model, with_material = setup.model, setup.model.stages[stage].moves_material
+    times = _train_steps(setup, stage, limit)
+    model.eval()
+    times.picture = _picture_seconds(setup, with_material)
+    sample = setup.pixels.sample(CHECKED_PIXELS, gradients=False)
+    times.health_check = setup.seconds(lambda: measure_surface(model, sample, with_material))
+    model.train()
+    return times
+
+
+def _train_steps(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
     """Time steps of a stage as `train.loop` takes them.
 
     It ends when the time limit has passed and, if the stage fits the light, two fits have been made, or after
     `MAX_STEPS` timed steps.
     """
+    model, solver, optimizer, config = setup.model, setup.solver, setup.optimizer, setup.trial_config
     model.freeze_for(stage)
-    times, began = _Seconds(), time.perf_counter()
+    times, began = _StageTimes(), time.perf_counter()
     fits = model.stages[stage].moves_material and not isinstance(solver, NothingToSolve)
     gradients = "smoothness" in active_losses(stage, config, model.stages)
     for number in range(WARM_STEPS + MAX_STEPS):
         step_began = time.perf_counter()
         seed_step(config.train.seed, number)
         set_rates(optimizer, config.optimizer, StagePosition(stage, number, WARM_STEPS + MAX_STEPS))
-        computed = model.step(pixels.sample(config.train.rays, gradients), stage)
+        computed = model.step(setup.pixels.sample(config.train.rays, gradients), stage)
         optimizer.zero_grad(set_to_none=True)
         total = weigh(computed.terms, active_losses(stage, config, model.stages)).loss
         if total.requires_grad:
             total.backward()
             optimizer.step()
-        wait()
+        setup.wait()
         if number >= WARM_STEPS:
             times.steps.append(time.perf_counter() - step_began)
         solver.observe(computed)
         if solver.due:
-            times.fits.append(_timed(lambda: solver.solve(model.brdf, model.scene), wait))
+            times.fits.append(setup.seconds(lambda: solver.solve(model.brdf, model.scene)))
         if (
             number >= WARM_STEPS + MIN_STEPS
             and time.perf_counter() - began > limit
@@ -242,23 +335,10 @@ def _review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None
         review_surface(Plan(plan.request, plan.settings, [*plan.decisions]), model, pixels, 0)
 
 
-def _picture_seconds(
-    model: NeilfModel,
-    capture: Capture,
-    pixels: PixelDataset,
-    with_material: bool,
-    wait: Callable[[], object],
-) -> float:
+def _picture_seconds(setup: _Setup, with_material: bool) -> float:
     """Estimate the time of the picture at the end of a stage from that of some of its rays."""
-    warm, timed = (pixels.sample(count, gradients=False).rays for count in (WARM_RAYS, PICTURE_RAYS))
-    once = _timed(lambda: model.maps(warm, with_material), wait)
-    part = _timed(lambda: model.maps(timed, with_material), wait)
-    return once + part * preview_pixels(capture) / PICTURE_RAYS
-
-
-def _timed(work: Callable[[], object], wait: Callable[[], object]) -> float:
-    """Time of a function call including its work on the device, in seconds."""
-    began = time.perf_counter()
-    work()
-    wait()
-    return time.perf_counter() - began
+    model = setup.model
+    warm, timed = (setup.pixels.sample(count, gradients=False).rays for count in (WARM_RAYS, PICTURE_RAYS))
+    once = setup.seconds(lambda: model.maps(warm, with_material))
+    part = setup.seconds(lambda: model.maps(timed, with_material))
+    return once + part * preview_pixels(setup.capture) / PICTURE_RAYS

@@ -94,7 +94,7 @@ def subject_of(run: Run, resolution: int) -> Subject:
     try:
         surface, note = surface_of_run(run, resolution), ""
     except UserError as error:
-        surface, note = None, f"Only R can be shown, because there is no surface yet: {error.problem}."
+        surface, note = None, f"Only R can be shown: {error.problem}; {error.remedy}."
     if surface is not None and not run.has_material:
         note = f"There is no material at step {run.step}: train the next stage."
     return Subject(run, surface, note)

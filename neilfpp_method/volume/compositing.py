@@ -61,8 +61,8 @@ def share_near(
     Args:
         distances: ends of the intervals, ascending.
         weights: weights of the intervals.
-        depth: center along each ray.
-        radius: largest distance from the center.
+        depth: centre along each ray.
+        radius: largest distance from the centre.
     """
     start = torch.maximum(distances[:, :-1], depth[:, None] - radius)
     end = torch.minimum(distances[:, 1:], depth[:, None] + radius)
@@ -80,7 +80,7 @@ def render_weights(
         distances: t_i, ascending.
         far: end of the last interval.
     """
-    # Rounding in a sampler can swap neighboring samples by one unit in the last place: no negative widths.
+    # Rounding in a sampler can swap neighbouring samples by one unit in the last place: no negative widths.
     widths = torch.cat([distances, far[:, None]], dim=-1).diff(dim=-1).clamp_min(0.0)
     return depth_weights(density.to(torch.promote_types(density.dtype, torch.float32)) * widths)
 

@@ -43,7 +43,7 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
 def laplace_depth(
     sdf: Float[Tensor, "*shape M"], distances: Float[Tensor, "*shape M"], beta: Float[Tensor, "*#shape"]
 ) -> Float[Tensor, "*shape M-1"]:
-    """Optical depth between neighboring samples: the exact integral of the density for a linear SDF.
+    """Optical depth between neighbouring samples: the exact integral of the density for a linear SDF.
 
     With u = sdf/β an antiderivative of Ψ(−u) is F(u) = min(u, 0) − ½ e^{−|u|}, so an interval of width δ has
     the depth (δ/β) (F(u₁) − F(u₀)) / (u₁ − u₀). For a constant SDF this is δ σ.
@@ -77,7 +77,7 @@ def laplace_depth(
     at_ends = laplace_density(scaled, one)
     middle = laplace_density(0.5 * (scaled[..., :-1] + scaled[..., 1:]), one)
     simpson = (at_ends[..., :-1] + 4.0 * middle + at_ends[..., 1:]) / 6.0
-    # Rounding in a sampler can swap neighboring samples by one unit in the last place: no negative widths.
+    # Rounding in a sampler can swap neighbouring samples by one unit in the last place: no negative widths.
     return torch.where(close, simpson, quotient) * distances.diff(dim=-1).clamp_min(0.0) / beta
 
 

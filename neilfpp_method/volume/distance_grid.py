@@ -16,7 +16,18 @@ from torch.nn import functional
 
 from neilfpp_method.kernels import ray_tracer
 
-__all__ = ["GRID_RESOLUTION", "GridHits", "cell_size", "look_up", "sample_grid", "trace_grid"]
+__all__ = [
+    "GRID_RESOLUTION",
+    "GridHits",
+    "SignedDistance",
+    "cell_size",
+    "look_up",
+    "sample_grid",
+    "trace_grid",
+]
+
+SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
+"""Signed distance at points of the scene frame, negative inside."""
 
 GRID_RESOLUTION = 96
 """Vertices along an edge of the grid that hard inter-reflection traces."""
@@ -36,9 +47,7 @@ def cell_size(grid: Float[Tensor, "R R R"], radius: float) -> float:
 
 
 @torch.no_grad()
-def sample_grid(
-    sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]], radius: float, resolution: int, like: Tensor
-) -> Float[Tensor, "R R R"]:
+def sample_grid(sdf: SignedDistance, radius: float, resolution: int, like: Tensor) -> Float[Tensor, "R R R"]:
     """Sample a signed distance field at resolution³ vertices, with the device and dtype of `like`."""
     axis = torch.linspace(-radius, radius, resolution, device=like.device, dtype=like.dtype)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")

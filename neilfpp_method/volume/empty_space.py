@@ -11,7 +11,6 @@ part to be skipped. If one of them is not empty, no ray skips anything, and the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.volume.distance_grid import cell_size, look_up, sample_grid
+from neilfpp_method.volume.distance_grid import SignedDistance, cell_size, look_up, sample_grid
 from neilfpp_method.volume.intersect import Interval
 
 __all__ = ["EmptySpace", "Span"]
@@ -29,7 +28,7 @@ RAY_PARTS = 128
 RESOLUTION = 64
 """Vertices along an edge of the grid."""
 MARGIN = 1.1
-"""Ratio of the bound on the slope to the largest slope between neighboring vertices."""
+"""Ratio of the bound on the slope to the largest slope between neighbouring vertices."""
 MISSED = 0.01
 """Largest opacity of skipped space in training."""
 HARDLY_MISSED = 1e-3
@@ -44,8 +43,21 @@ MIN_LIFE, MAX_LIFE = 20, 100
 class Span:
     """Which rays have a part to be sampled, and the interval of this part; the whole ray if there is none."""
 
-    some: Bool[Tensor, " N"]
+    has_part: Bool[Tensor, " N"]
     interval: Interval
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The equal parts of rays: which are certainly empty, and which are certainly behind an opaque part."""
+
+    empty: Bool[Tensor, "N K"]
+    hidden: Bool[Tensor, "N K"]
+
+    @property
+    def may_show(self) -> Bool[Tensor, "N K"]:
+        """Which parts may show a surface."""
+        return ~self.empty & ~self.hidden
 
 
 class EmptySpace(nn.Module):
@@ -70,7 +82,7 @@ class EmptySpace(nn.Module):
     @torch.no_grad()
     def narrow(
         self,
-        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        sdf: SignedDistance,
         rays: RayBatch,
         interval: Interval,
         beta: Float[Tensor, ""],
@@ -83,18 +95,19 @@ class EmptySpace(nn.Module):
         """
         self._renew(sdf)
         edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
-        empty, opaque = self._known(rays, edges, clearance, beta)
-        if rays.origins.device.type == "cpu" and not self._holds(sdf, rays, edges, empty, clearance):
+        parts = self._parts(rays, edges, clearance, beta)
+        can_check = rays.origins.device.type == "cpu"
+        if can_check and not self._is_confirmed(sdf, rays, edges, parts.empty, clearance):
             if self.age is not None and self.age >= MIN_LIFE:
                 # Sample the grid again at its next use.
                 self.age = None
             return interval
-        return _span(edges, ~empty & ~opaque, interval).interval
+        return _span(edges, parts.may_show, interval).interval
 
     @torch.no_grad()
     def may_show(
         self,
-        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        sdf: SignedDistance,
         rays: RayBatch,
         interval: Interval,
         beta: Float[Tensor, ""],
@@ -106,13 +119,13 @@ class EmptySpace(nn.Module):
         """
         self._renew(sdf)
         edges = self._edges(interval)
-        empty, opaque = self._known(rays, edges, self._clearance(beta, HARDLY_MISSED), beta)
-        return _span(edges, ~empty & ~opaque, interval)
+        parts = self._parts(rays, edges, self._clearance(beta, HARDLY_MISSED), beta)
+        return _span(edges, parts.may_show, interval)
 
     @torch.no_grad()
     def may_hit(
         self,
-        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        sdf: SignedDistance,
         rays: RayBatch,
         interval: Interval,
         beta: Float[Tensor, ""],
@@ -127,31 +140,30 @@ class EmptySpace(nn.Module):
         self._renew(sdf)
         edges = self._edges(interval)
         distance = self._read(rays, edges)
-        empty = distance - self._doubt(edges) > self._clearance(beta, MISSED)
+        empty = distance - self._max_error(edges) > self._clearance(beta, MISSED)
         return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
 
-    def _renew(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
+    def _renew(self, sdf: SignedDistance) -> None:
         if self.age is None or self.age >= MAX_LIFE:
             self._sample(sdf)
 
-    def _sample(self, sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]) -> None:
+    def _sample(self, sdf: SignedDistance) -> None:
         self.distance.copy_(sample_grid(sdf, self.radius, RESOLUTION, self.distance))
         steps = torch.stack([self.distance.diff(dim=axis).abs().amax() for axis in range(3)])
         self.slope.copy_(MARGIN * steps.amax() / cell_size(self.distance, self.radius))
         self.age = 0
 
-    def _known(
+    def _parts(
         self,
         rays: RayBatch,
         edges: Float[Tensor, "N E"],
         clearance: Float[Tensor, ""],
         beta: Float[Tensor, ""],
-    ) -> tuple[Bool[Tensor, "N K"], Bool[Tensor, "N K"]]:
-        """Which parts of the rays are certainly empty, and which are certainly behind an opaque part."""
-        width, distance, doubt = edges.diff(dim=-1), self._read(rays, edges), self._doubt(edges)
+    ) -> _Parts:
+        width, distance, error = edges.diff(dim=-1), self._read(rays, edges), self._max_error(edges)
         # Inside, the density is at least 1 / (2 β).
-        depth = ((distance + doubt < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
-        return distance - doubt > clearance, depth - width / (2.0 * beta) > OPAQUE
+        depth = ((distance + error < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
+        return _Parts(distance - error > clearance, depth - width / (2.0 * beta) > OPAQUE)
 
     def _edges(self, interval: Interval) -> Float[Tensor, "N E"]:
         """The ends of the equal parts of each ray."""
@@ -159,13 +171,13 @@ class EmptySpace(nn.Module):
         return torch.lerp(interval.near[:, None], interval.far[:, None], share)
 
     def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """The grid's distance at the center of each part."""
+        """The grid's distance at the centre of each part."""
         middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
         points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
         return look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
 
-    def _doubt(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """Bound on the difference between the field in a part and the grid's value at its center."""
+    def _max_error(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
+        """Bound on the difference between the field in a part and the grid's value at its centre."""
         # The error of interpolation in a cell is at most the slope times half of the cell's diagonal.
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
         return self.slope * (0.5 * edges.diff(dim=-1) + reach)
@@ -175,9 +187,9 @@ class EmptySpace(nn.Module):
         # Solves e^(−G/β) · 2 radius / (2β) ≤ missed for G.
         return beta * math.log(self.radius / missed) - beta * beta.log()
 
-    def _holds(
+    def _is_confirmed(
         self,
-        sdf: Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]],
+        sdf: SignedDistance,
         rays: RayBatch,
         edges: Float[Tensor, "N E"],
         empty: Bool[Tensor, "N K"],
@@ -202,11 +214,11 @@ class EmptySpace(nn.Module):
 def _span(edges: Float[Tensor, "N E"], taken: Bool[Tensor, "N K"], interval: Interval) -> Span:
     first = taken.to(torch.int8).argmax(dim=-1, keepdim=True)
     last = RAY_PARTS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
-    some = taken.any(-1)
+    has_part = taken.any(-1)
     return Span(
-        some,
+        has_part,
         Interval(
-            torch.where(some, edges.gather(-1, first)[:, 0], interval.near),
-            torch.where(some, edges.gather(-1, last)[:, 0], interval.far),
+            torch.where(has_part, edges.gather(-1, first)[:, 0], interval.near),
+            torch.where(has_part, edges.gather(-1, last)[:, 0], interval.far),
         ),
     )

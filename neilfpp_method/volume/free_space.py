@@ -18,7 +18,7 @@ from torch import Tensor, nn
 __all__ = ["FREE_SHARE", "OBJECT_RADIUS", "FreeBalls", "FreeSpace", "FreeSpaceSample", "free_balls"]
 
 FREE_SHARE = 0.25
-"""Radius of the ball around a camera without a point cloud, relative to its distance from the scene's center:
+"""Radius of the ball around a camera without a point cloud, relative to its distance from the scene's centre:
 0.45 scene units for a camera at 1.8, the median distance if the scene box was computed from the focus of the
 cameras.
 """
@@ -57,7 +57,7 @@ def free_balls(
     """The free balls of cameras that reach into the scene sphere; None if there is none.
 
     The radius of a ball is `CLEAR_SHARE` of the distance to the closest points, without points `FREE_SHARE`
-    of the distance to the scene's center. It is at most that distance − `OBJECT_RADIUS`.
+    of the distance to the scene's centre. It is at most that distance − `OBJECT_RADIUS`.
 
     Args:
         cameras: camera positions, scene frame.
@@ -82,7 +82,7 @@ def free_balls(
 
 
 class FreeSpace(nn.Module):
-    """The union of free balls as a signed depth: max over balls of radius − ‖x − center‖.
+    """The union of free balls as a signed depth: max over balls of radius − ‖x − centre‖.
 
     The ball of the maximum is looked up at the closest vertex of a grid; the depth for this ball is exact.
     Where two balls meet, the depth is too small by at most one and a half cells.

@@ -11,7 +11,6 @@ Without the latter a ray that grazes a surface would be rendered too opaque.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +21,8 @@ from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.distance_grid import SignedDistance
+from neilfpp_method.volume.intersect import Interval
 
 __all__ = [
     "OPACITY_ERROR",
@@ -40,14 +41,12 @@ BISECTIONS = 10
 SPREAD = 1 / 3
 """Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
 
-SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
-
 
 # -------------------------------------------------------------------------------------------- simple samplers
 
 
 def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N {count}"]:
-    """Ascending numbers in [0, 1], one in each of `count` equal strata: random, or at the center."""
+    """Ascending numbers in [0, 1], one in each of `count` equal strata: random, or at the centre."""
     shape = (like.shape[0], count)
     within = like.new_empty(shape).uniform_() if stochastic else like.new_full(shape, 0.5)
     return (torch.arange(count, device=like.device, dtype=like.dtype) + within) / count
@@ -75,7 +74,7 @@ def inverse_cdf_samples(
         edges: bounds of the bins, ascending; a bin may have width 0.
         mass: probability mass of each bin, ≥ 0, up to a common factor.
         count: samples per ray, one in each of `count` equal shares of the mass.
-        stochastic: whether samples are random within their share; if False, they are at its center.
+        stochastic: whether samples are random within their share; if False, they are at its centre.
     """
     tiny = torch.finfo(edges.dtype).tiny
     mass = mass.to(edges.dtype)
@@ -88,7 +87,7 @@ def inverse_cdf_samples(
     u = strata(edges, count, stochastic).clamp_max(1.0 - torch.finfo(edges.dtype).eps)
     end = torch.searchsorted(cdf, u, right=True).clamp_max(mass.shape[-1])
     low, high = cdf.gather(-1, end - 1), cdf.gather(-1, end)
-    # The clamps only matter if a parallel sum has rounded neighboring values of the CDF out of order.
+    # The clamps only matter if a parallel sum has rounded neighbouring values of the CDF out of order.
     fraction = ((u - low) / (high - low).clamp_min(tiny)).clamp(0.0, 1.0)
     return torch.lerp(edges.gather(-1, end - 1), edges.gather(-1, end), fraction)
 
@@ -200,10 +199,8 @@ class ErrorBoundedSamples:
 @torch.no_grad()
 def error_bounded_samples(
     sdf: SignedDistance,
-    origins: Float[Tensor, "N 3"],
-    directions: Float[Tensor, "N 3"],
-    near: Float[Tensor, " N"],
-    far: Float[Tensor, " N"],
+    rays: RayBatch,
+    interval: Interval,
     beta: Float[Tensor, ""],
     config: VolumeConfig,
     stochastic: bool,
@@ -219,19 +216,19 @@ def error_bounded_samples(
 
     Args:
         sdf: signed distance at points of the scene frame, negative inside.
-        origins, directions: the rays, with unit directions.
-        near, far: distances at which rays enter and leave the scene; near = far for a ray that misses it.
+        rays: the rays.
+        interval: distances at which rays enter and leave the scene; near = far for a ray that misses it.
         beta: scale β of the density, scene units.
         config: `initial_samples`, `rounds` and `samples` are used.
         stochastic: whether the cuts and the samples are random; if False, they are central.
     """
-    rays = RayBatch(origins, directions)
+    near, count = interval.near, len(rays)
     beta = beta.to(near.dtype).reshape(1, 1)
-    samples = near.new_empty(len(rays), config.samples)
+    samples = near.new_empty(count, config.samples)
     error_bound = torch.empty_like(near)
 
-    rows = torch.arange(len(rays), device=near.device)
-    partition = first_cuts(sdf, rays, near, far, config.initial_samples, stochastic)
+    rows = torch.arange(count, device=near.device)
+    partition = first_cuts(sdf, rays, interval, config.initial_samples, stochastic)
     queries = partition.distances.numel()
     # The bound at this scale is ≤ ε even if the surface touched every interval (VolSDF Lemma 2).
     worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
@@ -256,7 +253,7 @@ def error_bounded_samples(
         queries += len(rows) * config.initial_samples
 
     samples[rows] = opacity_samples(partition, beta_plus, config.samples, stochastic)
-    return ErrorBoundedSamples(samples, error_bound, queries / max(len(origins), 1))
+    return ErrorBoundedSamples(samples, error_bound, queries / max(count, 1))
 
 
 def can_leave_early(device: torch.device) -> bool:
@@ -265,15 +262,10 @@ def can_leave_early(device: torch.device) -> bool:
 
 
 def first_cuts(
-    sdf: SignedDistance,
-    rays: RayBatch,
-    near: Float[Tensor, " N"],
-    far: Float[Tensor, " N"],
-    count: int,
-    stochastic: bool,
+    sdf: SignedDistance, rays: RayBatch, interval: Interval, count: int, stochastic: bool
 ) -> Partition:
     """Cut rays uniformly by `count` cuts, both ends included."""
-    distances = uniform_samples(near, far, count, stochastic)
+    distances = uniform_samples(interval.near, interval.far, count, stochastic)
     return cut(distances, query(sdf, rays, distances))
 
 

@@ -26,7 +26,7 @@ def test_a_decreasing_series_is_drawn_downwards(tmp_path):
     assert middle == pytest.approx((left[0] + right[0]) / 2, abs=4)  # equal steps of a logarithm are equal
 
 
-def test_a_series_has_the_same_colour_in_all_panels(tmp_path):
+def test_a_series_has_the_same_color_in_all_panels(tmp_path):
     rising = Line((1, 2), (1, 2))
     charts = [Chart("one", {"a": rising, "b": rising}), Chart("two", {"b": rising})]
     draw_charts(tmp_path / "chart.png", "", "x", "y", charts, columns=2)

@@ -26,7 +26,7 @@ def test_the_host_without_defects_passes():
     assert check_host(Scene(), rays_from_above()).hits > 150
 
 
-def test_all_defects_but_wrong_colours_are_found(found):
+def test_all_defects_but_wrong_colors_are_found(found):
     """Without a photograph of known radiance, wrong colours cannot be detected."""
     missed = {name for name, check in found.items() if check is None}
     assert missed == {"colours in display values", "red and blue exchanged"}

@@ -1,4 +1,4 @@
-"""A small capture, and a run that the command line has trained on it."""
+"""A run that the command line has trained on a small capture."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from neilfpp_method.settings.presets import PRESETS
-from tests.commands.calls import train
-from tests.data.make_capture import make_capture
+from tests.calls import train_tiny
 from tests.train.small_runs import small_config
 
 
@@ -18,14 +17,10 @@ def _tiny_preset(monkeypatch):
 
 
 @pytest.fixture(scope="package")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+def capture(masked_capture: Path) -> Path:
+    return masked_capture
 
 
 @pytest.fixture(scope="package")
 def trained(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "sphere"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", small_config)
-        assert train("--data", capture, "--out", out) == 0
-    return out
+    return train_tiny(capture, tmp_path_factory.mktemp("runs") / "sphere")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.images import read_image, write_exr, write_png
-from tests.commands.calls import refused
+from tests.calls import refused
 
 
 def edit_scene(change: Callable[[dict, dict], object]) -> Callable[[Path], None]:

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.commands.calls import refused
+from tests.calls import refused
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from neilfpp_method.commands.evaluate import Eval
 from neilfpp_method.data.images import read_image
 from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS
-from tests.data.make_capture import CENTRE, RADIUS
+from tests.data.make_capture import CENTER, RADIUS
 
 
 def test_train_says_what_it_does_and_leaves_a_run(trained):
@@ -116,7 +116,7 @@ def test_export_writes_the_surface_where_it_was_captured(trained, tmp_path, capf
     assert {path.name for path in (out / "light").rglob("*.exr")} == {"0000.exr", "0001.exr"}
     mesh = trimesh.load(out / "mesh.ply")
     assert mesh.is_watertight
-    assert np.linalg.norm(mesh.centroid - CENTRE) < 0.25 * RADIUS
+    assert np.linalg.norm(mesh.centroid - CENTER) < 0.25 * RADIUS
     assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
 
 

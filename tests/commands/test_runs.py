@@ -8,7 +8,7 @@ import shutil
 import pytest
 
 from neilfpp_method.cli import main
-from tests.commands.calls import refused
+from tests.calls import refused
 
 
 def test_a_folder_that_is_taken(tmp_path, capfd, capture):

@@ -16,9 +16,8 @@ from neilfpp_method.compare.sheet import shortened
 from neilfpp_method.compare.write import compare_runs
 from neilfpp_method.data.images import image_header, read_image
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.presets import PRESETS
+from tests.calls import train_tiny
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config
 
 CELL, GAP, LEFT, TOP = 240, 8, 290, 206
 """Layout of a sheet: width of an image, distance between two images, and position of the first one, in
@@ -29,11 +28,7 @@ STEPS = [f"--config.train.{stage}-steps=2" for stage in ("sdf", "material", "joi
 
 
 def train(capture: Path, out: Path, *options: str) -> Path:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", small_config)
-        command = ["train", "--data", str(capture), "--out", str(out), "--preset", "tiny", "--device", "cpu"]
-        assert main([*command, "--no-report", *STEPS, *options]) == 0
-    return out
+    return train_tiny(capture, out, "--no-report", *STEPS, *options)
 
 
 @pytest.fixture(scope="module")

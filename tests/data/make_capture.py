@@ -14,7 +14,7 @@ import trimesh
 
 from neilfpp_method.data.images import write_exr, write_png
 
-CENTRE = np.array([0.3, -0.2, 0.5])
+CENTER = np.array([0.3, -0.2, 0.5])
 RADIUS = 1.2
 SCALE = 1.5
 DISTANCE = 5.0
@@ -52,7 +52,7 @@ def camera_pose(i: int, views: int) -> np.ndarray:
     rotation = np.stack([right, np.cross(forward, right), forward])
     w2c = np.eye(4)
     w2c[:3, :3] = rotation
-    w2c[:3, 3] = -rotation @ (CENTRE + DISTANCE * outward)
+    w2c[:3, 3] = -rotation @ (CENTER + DISTANCE * outward)
     return w2c
 
 
@@ -86,11 +86,11 @@ def make_capture(
         local = np.stack([(u - center[0]) / focal[0], (v - center[1]) / focal[1], np.ones_like(u)], axis=-1)
         rays = local @ rotation
         # |eye + t·ray − centre| = radius; rays have unit depth, so t is the z-depth.
-        a, b = (rays**2).sum(-1), rays @ (eye - CENTRE)
-        root_term = b**2 - a * (((eye - CENTRE) ** 2).sum() - RADIUS**2)
+        a, b = (rays**2).sum(-1), rays @ (eye - CENTER)
+        root_term = b**2 - a * (((eye - CENTER) ** 2).sum() - RADIUS**2)
         hit = root_term > 0
         depth = np.where(hit, (-b - np.sqrt(root_term.clip(0))) / a, 0.0)
-        normal = np.where(hit[..., None], (eye + depth[..., None] * rays - CENTRE) / RADIUS, 0.0)
+        normal = np.where(hit[..., None], (eye + depth[..., None] * rays - CENTER) / RADIUS, 0.0)
         color = np.where(hit[..., None], radiance(normal), background)
         if hdr:
             write_exr(inputs / "images" / f"{i:03d}.exr", {"RGB": color.astype(np.float32)})
@@ -117,7 +117,7 @@ def make_capture(
         tracks[str(i)] = {"flg": 2, "size": [width, height], "camera": camera}
         files[str(i)] = f"images/{i:03d}{suffix}"
     box = np.diag([2 * SCALE, 2 * SCALE, 2 * RADIUS, 1.0])
-    box[:3, 3] = CENTRE
+    box[:3, 3] = CENTER
     scene = {
         "camera_track_map": {"images": tracks},
         "image_path": {"file_paths": files},
@@ -134,12 +134,12 @@ def _write_surface(folder: Path) -> None:
     """The sphere as a mesh and as 500 oriented points."""
     folder.mkdir()
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
-    sphere.apply_translation(CENTRE)
+    sphere.apply_translation(CENTER)
     sphere.export(folder / "mesh.ply")
     k = np.arange(500)
     z, azimuth = 1 - (k + 0.5) / 250, k * np.pi * (3 - np.sqrt(5))
     normal = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], axis=1)
-    write_ply(folder / "oriented_pcd.ply", CENTRE + RADIUS * normal, normal)
+    write_ply(folder / "oriented_pcd.ply", CENTER + RADIUS * normal, normal)
 
 
 def write_ply(path: Path, position: np.ndarray, normal: np.ndarray) -> None:

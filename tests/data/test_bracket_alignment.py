@@ -87,8 +87,8 @@ def test_pixels_outside_a_moved_image_come_from_the_other_exposures() -> None:
 
 
 def test_images_without_detail_are_unchanged() -> None:
-    grey = tuple(np.full((40, 60, 3), level, np.float32) for level in (0.1, 0.3, 0.8))
-    assert align(Bracket(grey, TIMES)).moved == 0
+    gray = tuple(np.full((40, 60, 3), level, np.float32) for level in (0.1, 0.3, 0.8))
+    assert align(Bracket(gray, TIMES)).moved == 0
     noise = tuple(
         np.random.default_rng(i).uniform(0.1, 0.9, (90, 120, 3)).astype(np.float32) for i in range(3)
     )

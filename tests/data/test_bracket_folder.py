@@ -62,7 +62,7 @@ def test_a_folder_of_photographs_becomes_radiance(tmp_path: Path, layout: str, r
 
 
 def bad_folder(root: Path, kind: str) -> None:
-    grey, times = np.full((4, 4, 3), 0.5), (0.1, 0.2)
+    gray, times = np.full((4, 4, 3), 0.5), (0.1, 0.2)
     for i, time in enumerate(times):
         size = (4 + i, 4) if kind == "two sizes" else (4, 4)
         same = kind in ("same exposure", "one image") or (kind == "no exif" and i)
@@ -76,11 +76,11 @@ def bad_folder(root: Path, kind: str) -> None:
     }
     lists["bad name"] = '{"../a": ["a_0.png", "a_1.png"]}'
     if kind in lists:
-        write_photograph(root.parent / "x.png", grey)
+        write_photograph(root.parent / "x.png", gray)
         (root / "brackets.json").write_text(lists[kind])
     if kind == "hdr":
-        cv2.imwrite(str(root / "b_0.hdr"), grey.astype(np.float32))
-        cv2.imwrite(str(root / "b_1.hdr"), grey.astype(np.float32))
+        cv2.imwrite(str(root / "b_0.hdr"), gray.astype(np.float32))
+        cv2.imwrite(str(root / "b_1.hdr"), gray.astype(np.float32))
         (root / "exposures.txt").write_text("a_0.png 1\na_1.png 2\nb_0.hdr 1\nb_1.hdr 2\n")
 
 

@@ -14,7 +14,7 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.views import camera_rays, project
-from tests.data.make_capture import CENTRE, RADIUS, SCALE, camera_pose, make_capture
+from tests.data.make_capture import CENTER, RADIUS, SCALE, camera_pose, make_capture
 
 DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 
@@ -41,7 +41,7 @@ def test_projection_is_k_times_w2c(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frame", ["world", "scene"])
-def test_rays_project_back_to_pixel_centres(tmp_path: Path, frame: str) -> None:
+def test_rays_project_back_to_pixel_centers(tmp_path: Path, frame: str) -> None:
     capture = load_capture(make_capture(tmp_path))
     for view in capture.views:
         camera = view.camera if frame == "world" else capture.normalisation.camera(view.camera)
@@ -57,7 +57,7 @@ def test_rays_project_back_to_pixel_centres(tmp_path: Path, frame: str) -> None:
 def test_scene_frame(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path))
     to_scene, to_world = capture.normalisation.to_scene, capture.normalisation.to_world
-    north = torch.tensor([[CENTRE[0], CENTRE[1], CENTRE[2] + RADIUS]], dtype=torch.float64)
+    north = torch.tensor([[CENTER[0], CENTER[1], CENTER[2] + RADIUS]], dtype=torch.float64)
     assert torch.allclose(to_scene(north), torch.tensor([[0, 0, RADIUS / SCALE]], dtype=torch.float64))
     points = torch.randn(2, 7, 3, dtype=torch.float64)
     assert torch.allclose(to_world(to_scene(points)), points)
@@ -115,7 +115,7 @@ def test_without_a_box_the_point_cloud_defines_the_scene(tmp_path: Path) -> None
     edit_scene(tmp_path, lambda scene: scene.pop("bbox"))
     normalisation = load_capture(tmp_path).normalisation
     assert normalisation.scale == pytest.approx(RADIUS, rel=0.01)
-    assert normalisation.centre == pytest.approx(CENTRE, abs=0.02)
+    assert normalisation.center == pytest.approx(CENTER, abs=0.02)
 
 
 # ----------------------------------------------------------------------------------------- split and response

@@ -19,7 +19,7 @@ from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.views import CaptureFiles, Normalisation
 from neilfpp_method.errors import UserError
-from tests.data.make_capture import CENTRE, SCALE, camera_pose, make_capture
+from tests.data.make_capture import CENTER, SCALE, camera_pose, make_capture
 
 DOCS = Path(__file__).parents[2] / "docs" / "captures.md"
 
@@ -123,7 +123,7 @@ def test_a_minimal_folder_is_read(tmp_path: Path) -> None:
         "format": "neilfpp-capture",
         "version": 1,
         "response": "linear",
-        "scene": {"centre": CENTRE.tolist(), "radius": SCALE},
+        "scene": {"centre": CENTER.tolist(), "radius": SCALE},
         "views": [{"name": "a", "image": "a.exr", "camera": camera}],
     }
     (tmp_path / "capture.json").write_text(json.dumps(content))

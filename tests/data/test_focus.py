@@ -53,14 +53,14 @@ def room(count: int = 3000, half: float = 12.0) -> np.ndarray:
 
 def test_cameras_on_a_ring_look_at_its_middle(image):
     focus = find_focus(around(image))
-    assert focus.centre == pytest.approx(PLACE, abs=1e-6)
+    assert focus.center == pytest.approx(PLACE, abs=1e-6)
     assert focus.distance == pytest.approx(4.0)
     assert focus.looking.all()
 
 
 def test_aim_is_averaged(image):
     focus = find_focus(around(image, count=60, aim=0.5))
-    assert np.linalg.norm(focus.centre - PLACE) < 0.15
+    assert np.linalg.norm(focus.center - PLACE) < 0.15
 
 
 def test_a_quarter_of_cameras_that_look_elsewhere_has_no_influence(image):
@@ -70,7 +70,7 @@ def test_a_quarter_of_cameras_that_look_elsewhere_has_no_influence(image):
         for d in random.normal(size=(8, 3))
     ]
     focus = find_focus([*around(image), *away])
-    assert np.linalg.norm(focus.centre - PLACE) < 0.1
+    assert np.linalg.norm(focus.center - PLACE) < 0.1
     assert focus.looking[:24].all()
 
 
@@ -79,7 +79,7 @@ def test_a_distant_background_does_not_define_the_box(image):
     assert box_of_points(points).scale > 10, "the box of all points holds the cameras"
     box = find_box(views, points)
     assert box.source == "focus"
-    assert box.normalisation.centre == pytest.approx(tuple(PLACE), abs=1e-6)
+    assert box.normalisation.center == pytest.approx(tuple(PLACE), abs=1e-6)
     assert box.normalisation.scale == pytest.approx(REACH * 4.0)
     distances = [np.linalg.norm(box.normalisation.camera(view.camera).c2w[:, 3]) for view in views]
     assert min(distances) == pytest.approx(1 / REACH)
@@ -105,12 +105,12 @@ def test_points_define_the_box_of_forward_facing_cameras(image, turned):
 
 def test_cameras_side_by_side_that_turn_towards_an_object_have_a_focus(image):
     focus = find_focus(around(image, count=9, arc=np.pi / 2))
-    assert focus.centre == pytest.approx(PLACE, abs=1e-6)
+    assert focus.center == pytest.approx(PLACE, abs=1e-6)
 
 
 def test_two_cameras(image):
     apart, close = (around(image, count=2, arc=arc) for arc in (np.pi, 0.2))
-    assert find_focus(apart).centre == pytest.approx(PLACE, abs=1e-6)
+    assert find_focus(apart).center == pytest.approx(PLACE, abs=1e-6)
     assert find_focus(close) is None, (
         "twelve degrees between them, and any depth may be that of a careless aim"
     )

@@ -14,7 +14,7 @@ from neilfpp_method.data.lens import LENSES, Lens, lens_of
 from neilfpp_method.data.undistort import resample, straight_camera
 from neilfpp_method.data.views import Camera, CameraRays, camera_rays, check_camera, project
 from neilfpp_method.errors import UserError
-from tests.data.make_capture import CENTRE, camera_pose
+from tests.data.make_capture import CENTER, camera_pose
 
 # Typical coefficients of a calibration, by model.
 COEFFICIENTS = {
@@ -47,16 +47,16 @@ COEFFICIENTS = {
     "FISHEYE": [],
     "EUCM": [0.55, 1.05],
 }
-FOCAL, CENTRE_PIXEL, SIZE = (52.0, 52.0), (41.5, 28.0), (80, 60)
+FOCAL, CENTER_PIXEL, SIZE = (52.0, 52.0), (41.5, 28.0), (80, 60)
 
 
 def camera(model: str, focal: tuple[float, float] = FOCAL) -> Camera:
-    return Camera(*focal, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens(model, tuple(COEFFICIENTS[model])))
+    return Camera(*focal, *CENTER_PIXEL, *SIZE, camera_pose(1, 6), Lens(model, tuple(COEFFICIENTS[model])))
 
 
 def seen_points(count: int = 200) -> np.ndarray:
     """Points around the scene's centre, at which the camera of `camera_pose` looks."""
-    return CENTRE + np.random.default_rng(3).uniform(-1.5, 1.5, (count, 3))
+    return CENTER + np.random.default_rng(3).uniform(-1.5, 1.5, (count, 3))
 
 
 def local(points: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def test_projection_is_that_of_pycolmap(model: str) -> None:
     names = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1).params_info.split(", ")
     focal = [FOCAL[0]] if names[0] == "f" else list(FOCAL)
     oracle = pycolmap.Camera(
-        model=model, width=SIZE[0], height=SIZE[1], params=[*focal, *CENTRE_PIXEL, *COEFFICIENTS[model]]
+        model=model, width=SIZE[0], height=SIZE[1], params=[*focal, *CENTER_PIXEL, *COEFFICIENTS[model]]
     )
     points = seen_points()
     seen = project(camera(model), torch.from_numpy(points))
@@ -84,7 +84,7 @@ def test_projection_is_that_of_pycolmap(model: str) -> None:
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"])
 def test_projection_is_that_of_opencv(model: str) -> None:
     focal = (52.0, 55.0)  # two focal lengths; the simple models take them as well
-    k = np.array([[focal[0], 0, CENTRE_PIXEL[0]], [0, focal[1], CENTRE_PIXEL[1]], [0, 0, 1]])
+    k = np.array([[focal[0], 0, CENTER_PIXEL[0]], [0, focal[1], CENTER_PIXEL[1]], [0, 0, 1]])
     points, zero = local(seen_points())[:, None], np.zeros(3)
     coefficients = np.array(COEFFICIENTS[model])
     if model == "OPENCV_FISHEYE":
@@ -97,7 +97,7 @@ def test_projection_is_that_of_opencv(model: str) -> None:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_rays_project_back_to_pixel_centres(model: str) -> None:
+def test_rays_project_back_to_pixel_centers(model: str) -> None:
     rays = camera_rays(camera(model))
     assert torch.allclose(rays.directions.norm(dim=-1), torch.ones(()), atol=1e-5)
     seen = project(camera(model), (rays.origins + 3.0 * rays.directions).double())
@@ -108,8 +108,8 @@ def test_rays_project_back_to_pixel_centres(model: str) -> None:
 
 def test_rays_of_many_cameras_are_not_confused() -> None:
     lens, other = camera("OPENCV"), camera("OPENCV_FISHEYE")
-    moved = Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(4, 6), lens.lens)
-    pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
+    moved = Camera(*FOCAL, *CENTER_PIXEL, *SIZE, camera_pose(4, 6), lens.lens)
+    pinhole = Camera(*FOCAL, *CENTER_PIXEL, 30, 20, camera_pose(2, 6))
     cameras = [pinhole, lens, other, moved]
     rays = CameraRays(cameras)
     number = torch.tensor([3, 0, 2, 1, 1, 3, 0])
@@ -138,14 +138,14 @@ def test_a_lens_without_distortion_is_a_pinhole() -> None:
 )
 def test_bad_lenses_are_refused(lens: Lens, words: str) -> None:
     with pytest.raises(UserError, match="view 7.*" + words):
-        check_camera(Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), lens), "view 7")
+        check_camera(Camera(*FOCAL, *CENTER_PIXEL, *SIZE, camera_pose(1, 6), lens), "view 7")
 
 
 def barrel(strength: float) -> Camera:
     """A lens with x·(1 − s x²), which decreases beyond x = 1/√(3 s). Its maximum is 2/3 of that x, and no ray
     reaches pixels beyond it.
     """
-    return Camera(*FOCAL, *CENTRE_PIXEL, *SIZE, camera_pose(1, 6), Lens("RADIAL", (-strength, 0.0)))
+    return Camera(*FOCAL, *CENTER_PIXEL, *SIZE, camera_pose(1, 6), Lens("RADIAL", (-strength, 0.0)))
 
 
 def test_a_lens_that_shows_nothing_at_most_pixels_is_refused() -> None:
@@ -155,13 +155,13 @@ def test_a_lens_that_shows_nothing_at_most_pixels_is_refused() -> None:
 
 def test_pixels_at_which_a_lens_shows_nothing_are_marked_and_point_away() -> None:
     seen_by = barrel(0.3)
-    pinhole = Camera(*FOCAL, *CENTRE_PIXEL, 30, 20, camera_pose(2, 6))
+    pinhole = Camera(*FOCAL, *CENTER_PIXEL, 30, 20, camera_pose(2, 6))
     rays = CameraRays([pinhole, seen_by])
     assert rays.has_ray(0).shape == (600,)
     assert rays.has_ray(0).all()
     rows, columns = np.mgrid[: SIZE[1], : SIZE[0]]
     radius = (
-        np.hypot(columns.ravel() + 0.5 - CENTRE_PIXEL[0], rows.ravel() + 0.5 - CENTRE_PIXEL[1]) / FOCAL[0]
+        np.hypot(columns.ravel() + 0.5 - CENTER_PIXEL[0], rows.ravel() + 0.5 - CENTER_PIXEL[1]) / FOCAL[0]
     )
     edge = 2 / 3 / np.sqrt(3 * 0.3)
     with_ray = rays.has_ray(1).numpy()

@@ -15,14 +15,14 @@ from tests.data.test_bracket_folder import write_photograph
 
 
 def test_exposure_from_exif(tmp_path: Path) -> None:
-    grey = np.full((4, 4, 3), 0.5)
-    write_photograph(tmp_path / "a.jpg", grey, 1 / 60)
+    gray = np.full((4, 4, 3), 0.5)
+    write_photograph(tmp_path / "a.jpg", gray, 1 / 60)
     assert photo_exposure(tmp_path / "a.jpg") == pytest.approx(1 / 60)
     exif = Image.Exif()
     exif[0x8769] = {0x829A: IFDRational(1, 60), 0x829D: IFDRational(4, 1), 0x8827: 400}
     Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "b.jpg", exif=exif)
     assert photo_exposure(tmp_path / "b.jpg") == pytest.approx(1 / 60 * 4 / 16)
-    write_photograph(tmp_path / "c.png", grey)
+    write_photograph(tmp_path / "c.png", gray)
     assert photo_exposure(tmp_path / "c.png") is None
     (tmp_path / "d.nef").write_bytes(b"no image")
     assert photo_exposure(tmp_path / "d.nef") is None

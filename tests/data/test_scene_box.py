@@ -13,12 +13,12 @@ from neilfpp_method.data.images import read_image, write_png
 from neilfpp_method.data.scene_box import box_of_cameras, box_of_points, find_box
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
-from tests.data.make_capture import CENTRE, DISTANCE, RADIUS, camera_pose, make_capture
+from tests.data.make_capture import CENTER, DISTANCE, RADIUS, camera_pose, make_capture
 
 
 def sphere_points(count: int = 2000) -> np.ndarray:
     points = np.random.default_rng(0).normal(size=(count, 3))
-    return CENTRE + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+    return CENTER + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 def views(root: Path, masks: bool = False, count: int = 8) -> tuple[View, ...]:
@@ -28,21 +28,21 @@ def views(root: Path, masks: bool = False, count: int = 8) -> tuple[View, ...]:
 def test_points_define_the_box_in_spite_of_outliers() -> None:
     points = np.concatenate([sphere_points(), 900 * np.eye(3)])
     box = box_of_points(points)
-    assert np.allclose(box.centre, CENTRE, atol=0.03 * RADIUS)
+    assert np.allclose(box.center, CENTER, atol=0.03 * RADIUS)
     assert RADIUS < box.scale < 1.15 * RADIUS
 
 
 def test_the_visual_hull_contains_the_object_closely(tmp_path: Path) -> None:
     box = find_box(views(tmp_path, masks=True, count=16)).normalisation
-    assert np.allclose(box.centre, CENTRE, atol=0.15 * RADIUS)
+    assert np.allclose(box.center, CENTER, atol=0.15 * RADIUS)
     assert RADIUS < box.scale < 1.3 * RADIUS
-    assert np.abs(sphere_points() - box.centre).max() <= box.scale
+    assert np.abs(sphere_points() - box.center).max() <= box.scale
 
 
 def test_cameras_without_points_and_masks_define_the_box(tmp_path: Path) -> None:
     # The shorter side of the image spans 1 / 1.5 of the distance.
     box = box_of_cameras(views(tmp_path))
-    assert np.allclose(box.centre, CENTRE, atol=1e-6)
+    assert np.allclose(box.center, CENTER, atol=1e-6)
     assert box.scale == pytest.approx(DISTANCE / (2 * 1.5))
 
 
@@ -56,9 +56,9 @@ def test_the_most_reliable_source_is_used(tmp_path: Path) -> None:
 
 
 def test_points_outside_the_masks_are_ignored(tmp_path: Path) -> None:
-    table = CENTRE + np.random.default_rng(1).uniform(-4, 4, (4000, 3)) * [1, 1, 0] - [0, 0, RADIUS]
+    table = CENTER + np.random.default_rng(1).uniform(-4, 4, (4000, 3)) * [1, 1, 0] - [0, 0, RADIUS]
     box = find_box(views(tmp_path, masks=True), np.concatenate([sphere_points(), table])).normalisation
-    assert np.allclose(box.centre, CENTRE, atol=0.15 * RADIUS)
+    assert np.allclose(box.center, CENTER, atol=0.15 * RADIUS)
     assert box.scale < 1.3 * RADIUS
 
 

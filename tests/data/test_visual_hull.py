@@ -32,7 +32,7 @@ def camera_at(eye: Sequence[float], focal: float = 1.5 * SIZE, size: int = SIZE)
     return Camera(focal, focal, size / 2, size / 2, size, size, w2c)
 
 
-def disc(camera: Camera, centre: Sequence[float] = (0.0, 0.0, 0.0), radius: float = BALL) -> np.ndarray:
+def disc(camera: Camera, center: Sequence[float] = (0.0, 0.0, 0.0), radius: float = BALL) -> np.ndarray:
     """The silhouette of a ball, from the angle between the rays and the direction to its centre, without the
     package's projection.
     """
@@ -41,7 +41,7 @@ def disc(camera: Camera, centre: Sequence[float] = (0.0, 0.0, 0.0), radius: floa
         [(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones_like(rows)], axis=-1
     )
     rays = local @ camera.w2c[:3, :3] / np.linalg.norm(local, axis=-1, keepdims=True)
-    to = np.asarray(centre) - camera.c2w[:, 3]
+    to = np.asarray(center) - camera.c2w[:, 3]
     distance = np.linalg.norm(to)
     return rays @ to / distance > np.sqrt(1 - (radius / distance) ** 2)
 
@@ -109,9 +109,9 @@ def test_views_that_do_not_contain_a_point_are_ignored_there():
     assert (hull.at(x) - truth).abs().mean() < 2 * CELL
     # With only close-ups, no view shows the outline of the ball or the space outside the images.
     alone = visual_hull(close, 1.3, 32)
-    centre = (np.arange(32) + 0.5) * 2.6 / 32 - 1.3
+    center = (np.arange(32) + 0.5) * 2.6 / 32 - 1.3
     assert (
-        np.linalg.norm(np.stack(np.meshgrid(centre, centre, centre, indexing="ij"), -1)[alone], axis=-1).max()
+        np.linalg.norm(np.stack(np.meshgrid(center, center, center, indexing="ij"), -1)[alone], axis=-1).max()
         < 1.3
     )
 
@@ -152,7 +152,7 @@ def test_agreement_is_a_share_of_the_views_that_contain_the_point():
 
 def test_large_masks_are_read_small_with_cameras_to_match(tmp_path):
     camera = camera_at([0.0, 0.0, 4.0], focal=1.5 * 400, size=400)
-    mask = disc(camera, centre=(0.2, 0.1, 0.0))
+    mask = disc(camera, center=(0.2, 0.1, 0.0))
     write_png(tmp_path / "mask.png", np.where(mask, 255, 0).astype(np.uint8))
     view = View("0", 0, camera, tmp_path / "image.png", tmp_path / "mask.png")
     (outline,) = read_outlines([view], longest=100)

@@ -141,7 +141,7 @@ def exposed_model(response: str, log_gains: torch.Tensor, start: torch.Tensor | 
         "constant",
         log_gains=tuple((log_gains if start is None else start).flatten().tolist()),
     )
-    return NeilfModel(VolSdfHost(config, facts.radiance_scale, "constant"), config, facts)
+    return NeilfModel(VolSdfHost(config, facts), config, facts)
 
 
 @pytest.mark.parametrize("response", ["linear", "srgb"])

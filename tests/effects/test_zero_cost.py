@@ -50,7 +50,7 @@ def test_without_lamps_there_is_one_fit_and_no_candidate(lamps, monkeypatch):
 def test_without_an_open_background_there_is_no_field_of_it():
     def background_parameters(effects: str) -> int:
         config = settings(effects)
-        host = VolSdfHost(config, 3.0, config.background.kind)
+        host = VolSdfHost(config, SceneFacts("linear", 0.2, 3.0, config.background.kind))
         return sum(parameter.numel() for parameter in host.parameter_groups().get("background", []))
 
     assert background_parameters("all") > 0
@@ -62,7 +62,7 @@ def test_without_exposures_photographs_have_no_gains():
 
     def model(effects: str) -> NeilfModel:
         config = settings(effects)
-        return NeilfModel(VolSdfHost(config, 3.0, "constant"), config, facts)
+        return NeilfModel(VolSdfHost(config, facts), config, facts)
 
     assert model("all").gains is not None
     without = model("all,-exposure")

@@ -87,7 +87,7 @@ def test_a_view_sees_the_part_of_a_sphere_that_faces_it(run: Run, mode: str):
     normal = on_sphere(200)
     seen = views.sightings(run.model, SPHERE * normal, normal, len(views.cameras))
     for i, n in enumerate(normal):
-        towards = views.centres - SPHERE * n
+        towards = views.centers - SPHERE * n
         cosine = (towards / towards.norm(dim=-1, keepdim=True)) @ n
         # Pixels at the rim are half off the object, and grazing views are not used.
         assert (cosine > 0.2).sum() <= seen.visible[i].sum() <= (cosine > 0.05).sum()
@@ -101,8 +101,8 @@ def test_a_view_sees_the_part_of_a_sphere_that_faces_it(run: Run, mode: str):
 def test_the_first_views_are_far_from_one_another(run: Run):
     views = TrainingViews(run.capture)
     assert sorted(views.order) == list(range(len(views.cameras)))
-    gap = (views.centres[views.order[0]] - views.centres[views.order[1]]).norm()
-    assert gap == (views.centres - views.centres[views.order[0]]).norm(dim=-1).max()
+    gap = (views.centers[views.order[0]] - views.centers[views.order[1]]).norm()
+    assert gap == (views.centers - views.centers[views.order[0]]).norm(dim=-1).max()
 
 
 # ------------------------------------------------------------------------------------------------------ light
@@ -172,7 +172,7 @@ def test_points_with_unexplained_pixels_have_larger_errors(run: Run, evidence):
     assert (off > 1.0005 * usual)[looks > 0].float().mean() > 0.5
 
 
-def test_only_neighbours_are_smoothed(run: Run, evidence):
+def test_only_neighbors_are_smoothed(run: Run, evidence):
     apart = on_sphere(9)
     around = torch.nn.functional.normalize(
         apart[:1] + 0.01 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), dim=-1

@@ -115,9 +115,9 @@ def test_gamma_makes_the_medians_agree():
 
 @pytest.mark.parametrize("median", [0.0, 1.0])
 def test_gamma_is_finite_for_black_and_for_white(median):
-    level, grey = np.full((3, 1), median), np.full((3, 1), 0.5)
-    assert 0 < metrics.align_gamma(level, grey) < 1e3
-    assert 0 < metrics.align_gamma(grey, level) < 1e3
+    level, gray = np.full((3, 1), median), np.full((3, 1), 0.5)
+    assert 0 < metrics.align_gamma(level, gray) < 1e3
+    assert 0 < metrics.align_gamma(gray, level) < 1e3
 
 
 def test_scale_is_the_least_squares_factor_of_each_channel():

@@ -282,7 +282,7 @@ def test_the_observed_color_is_the_radiance_of_the_point(captures, kind):
     sent = scene.radiance(normal)
     observed = mean_observed_color(run.capture, points)
     error = np.abs(observed - (sent if kind == "hdr" else sent.clip(0, 1))).max(-1)
-    eyes = np.stack([view.camera.c2w[:, 3] - scene.CENTRE for view in run.capture.train_views]) / scene.SCALE
+    eyes = np.stack([view.camera.c2w[:, 3] - scene.CENTER for view in run.capture.train_views]) / scene.SCALE
     to_eyes = eyes - points.numpy()[:, None]
     cosines = (to_eyes * normal[:, None]).sum(-1) / np.linalg.norm(to_eyes, axis=-1)
     plain = cosines.max(-1) > 0.4  # the other points are visible only at grazing angles or not at all
@@ -367,7 +367,7 @@ def test_the_light_field_of_a_capture_is_evaluated_in_chunks(captures, tmp_path)
     field = light_field(torch.nn.functional.normalize(torch.randn(50_000, 3), dim=-1).tolist(), points=7)
     (root / "light").mkdir()
     arrays = {
-        "points": field.position * scene.SCALE + torch.tensor(scene.CENTRE).float(),
+        "points": field.position * scene.SCALE + torch.tensor(scene.CENTER).float(),
         "normals": field.normal,
     }
     arrays |= {"base_color": field.material.base_color, "roughness": torch.ones(7), "metallic": torch.ones(7)}

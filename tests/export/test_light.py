@@ -21,7 +21,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import OrientedPoints, RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
-from tests.data.make_capture import CENTRE, SCALE, make_capture
+from tests.data.make_capture import CENTER, SCALE, make_capture
 from tests.scenes import tiny_config
 
 RADIUS = 0.6
@@ -89,14 +89,14 @@ def test_lamps_give_the_same_irradiance_in_world_and_scene(tmp_path):
     described = json.loads((tmp_path / "light" / "lamps.json").read_text())
     assert described["format"] == 1
     assert [lamp["axis"] for lamp in described["lamps"]] == [None, [0.0, -1.0, 0.0]]
-    at = np.array([0.1, -0.2, 0.6])  # a point of the scene, which is CENTRE + SCALE · at in the world
+    at = np.array([0.1, -0.2, 0.6])  # a point of the scene, which is CENTER + SCALE · at in the world
     for lamp, position, intensity in zip(
         described["lamps"], POSITION.numpy(), INTENSITY.numpy(), strict=True
     ):
-        np.testing.assert_allclose(lamp["position"], CENTRE + SCALE * position, atol=1e-6)
+        np.testing.assert_allclose(lamp["position"], CENTER + SCALE * position, atol=1e-6)
         assert lamp["radius"] == pytest.approx(0.06 * SCALE)
         # Irradiance, intensity over squared distance, is the same in both frames.
-        distance = np.linalg.norm(np.array(lamp["position"]) - (CENTRE + SCALE * at))
+        distance = np.linalg.norm(np.array(lamp["position"]) - (CENTER + SCALE * at))
         expected = intensity / np.square(position - at).sum()
         np.testing.assert_allclose(np.array(lamp["intensity"]) / distance**2, expected, rtol=1e-5)
         np.testing.assert_allclose(
@@ -116,7 +116,7 @@ def test_probes_have_the_incident_light_above_the_surface(tmp_path, monkeypatch)
     theta, phi = np.pi * j / 8, 2 * np.pi * (i + 0.5) / 18
     directions = np.stack((np.sin(phi) * np.sin(theta), np.cos(phi) * np.sin(theta), np.cos(theta)), -1)
     for listed in described["probes"]:
-        outwards = (np.array(listed["position"]) - CENTRE) / (SCALE * RADIUS)
+        outwards = (np.array(listed["position"]) - CENTER) / (SCALE * RADIUS)
         np.testing.assert_allclose(outwards, listed["normal"], atol=1e-4)
         shown, cosine = pixels(tmp_path / "light" / listed["file"]), directions @ np.array(listed["normal"])
         above = (cosine > 1e-3) & (j % 8 > 0)  # the rows of the poles are one direction each

@@ -18,7 +18,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
-from tests.data.make_capture import CENTRE, SCALE, make_capture, srgb
+from tests.data.make_capture import CENTER, SCALE, make_capture, srgb
 from tests.scenes import tiny_config
 
 RADIUS = 0.6
@@ -117,16 +117,16 @@ def make_run(folder: Path, host: torch.nn.Module, step: int) -> Run:
     return Run(folder, config, load_capture(make_capture(folder / "capture")), model.facts, model, step)
 
 
-def test_export_is_in_the_frame_of_the_capture_with_colours(tmp_path: Path):
+def test_export_is_in_the_frame_of_the_capture_with_colors(tmp_path: Path):
     run = make_run(tmp_path, Ball(), step=12)
     export_mesh(run, tmp_path / "mesh.ply", resolution=64)
     mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
-    from_centre = mesh.vertices - CENTRE
-    distance = np.linalg.norm(from_centre, axis=-1)
-    # One scene unit is SCALE world units, and the scene's origin is CENTRE.
+    from_center = mesh.vertices - CENTER
+    distance = np.linalg.norm(from_center, axis=-1)
+    # One scene unit is SCALE world units, and the scene's origin is CENTER.
     np.testing.assert_allclose(distance, SCALE * RADIUS, atol=2e-3)
-    assert ((mesh.vertex_normals * from_centre).sum(-1) / distance).min() > 0.98
-    linear = 0.5 + 0.5 * from_centre / SCALE
+    assert ((mesh.vertex_normals * from_center).sum(-1) / distance).min() > 0.98
+    linear = 0.5 + 0.5 * from_center / SCALE
     np.testing.assert_allclose(mesh.visual.vertex_colors[:, :3], 255 * srgb(linear), atol=0.51)
     # Roughness is 1 throughout, metallic 0; other programs find both by their names.
     stored = mesh.metadata["_ply_raw"]["vertex"]["data"]
@@ -139,7 +139,7 @@ def test_export_keeps_vertices_at_map_coordinates(tmp_path: Path):
     run = make_run(tmp_path, Ball(), step=4)
     offset = np.array([5e6, 4e5, 0.0])
     moved = dataclasses.replace(
-        run.capture.normalisation, centre=tuple(np.array(run.capture.normalisation.centre) + offset)
+        run.capture.normalisation, center=tuple(np.array(run.capture.normalisation.center) + offset)
     )
     far = dataclasses.replace(run, capture=dataclasses.replace(run.capture, normalisation=moved))
     export_mesh(run, tmp_path / "near.ply", resolution=32)
@@ -149,7 +149,7 @@ def test_export_keeps_vertices_at_map_coordinates(tmp_path: Path):
     assert np.array_equal(far.faces, near.faces)
 
 
-def test_export_before_the_material_stage_has_no_colours(tmp_path: Path):
+def test_export_before_the_material_stage_has_no_colors(tmp_path: Path):
     export_mesh(make_run(tmp_path, Ball(), step=4), tmp_path / "mesh.ply", resolution=32)
     assert trimesh.load_mesh(tmp_path / "mesh.ply").visual.kind is None
 

@@ -24,7 +24,7 @@ def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("encoding", [WAVES, GRID])
 @pytest.mark.parametrize("density", [-50.0, 0.0, 3.0, 50.0])
-def test_a_constant_colour_does_not_depend_on_the_density(density, encoding):
+def test_a_constant_color_does_not_depend_on_the_density(density, encoding):
     torch.manual_seed(0)
     field = InvertedSphere(CONFIG, encoding, radius=3.0, scale=2.0)
     with torch.no_grad():
@@ -45,10 +45,10 @@ def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
     torch.testing.assert_close(unit.norm(dim=-1), torch.ones_like(unit[..., 0]))
     expected = torch.tensor([(1 - (k + 0.5) / 8) / 2 for k in range(8)], dtype=torch.float64)
     torch.testing.assert_close(inverse[..., 0], expected.expand(20, 8))
-    travelled = unit / inverse - origins[:, None]
-    along = (travelled * directions[:, None]).sum(-1, keepdim=True)
+    traveled = unit / inverse - origins[:, None]
+    along = (traveled * directions[:, None]).sum(-1, keepdim=True)
     assert along.min() > 0
-    torch.testing.assert_close(travelled, along * directions[:, None])
+    torch.testing.assert_close(traveled, along * directions[:, None])
 
 
 def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
@@ -69,7 +69,7 @@ def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
 
 
 @pytest.mark.parametrize("start", [(0.25, 0.2, 0.15), (1.0, 0.5, 0.04)])
-def test_the_field_starts_with_the_given_colour(start):
+def test_the_field_starts_with_the_given_color(start):
     torch.manual_seed(0)
     field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.tensor(start))
     color = field(*(t.float() for t in rays(3.0)))
@@ -77,7 +77,7 @@ def test_the_field_starts_with_the_given_colour(start):
 
 
 @pytest.mark.parametrize("start", [0.0, 2.0, 5.0])
-def test_a_colour_out_of_range_does_not_stop_training(start):
+def test_a_color_out_of_range_does_not_stop_training(start):
     field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.full((3,), start))
     color = field(*(t.float() for t in rays(3.0)))
     color.sum().backward()

@@ -8,17 +8,12 @@ import torch
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import BrdfConfig, FrequencyConfig, HashGridConfig
+from tests.scenes import positions
 
 SMALL = {
     "sine": (BrdfConfig(layers=4, width=16), FrequencyConfig()),
     "hash": (BrdfConfig(layers=2, width=16), HashGridConfig(levels=3, log2_entries=9, max_resolution=32)),
 }
-
-
-def positions(count: int = 8) -> torch.Tensor:
-    return torch.empty(count, 3, dtype=torch.float64).uniform_(
-        -1, 1, generator=torch.Generator().manual_seed(1)
-    )
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])

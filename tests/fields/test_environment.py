@@ -23,7 +23,7 @@ def test_it_starts_at_one_radiance_everywhere():
     )
 
 
-def test_radiance_at_a_texel_centre_is_that_of_the_texel():
+def test_radiance_at_a_texel_center_is_that_of_the_texel():
     light = EnvironmentLight(9, 1.0)
     with torch.no_grad():
         light.log_radiance.normal_()

@@ -70,7 +70,7 @@ def test_shared_directions_give_the_same_radiance():
     assert seen == [7, 35]
 
 
-def test_monochrome_light_is_grey():
+def test_monochrome_light_is_gray():
     light = IncidentLightField(FreeLightConfig(monochrome=True), WAVES, 2.718281828, 1.0).radiance(*rays())
     assert light.shape == (5, 7, 3)
     assert (light == light[..., :1]).all()

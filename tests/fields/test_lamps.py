@@ -48,7 +48,7 @@ def test_lamps_hit_by_directions_give_the_same_irradiance_as_lamp_rays():
     torch.manual_seed(0)
     wi = normalize(torch.randn(1, 2_000_000, 3), dim=-1)
     wi[..., 2] = wi[..., 2].abs()
-    seen = light.met(torch.zeros(1, 3), wi, torch.full((1, 2_000_000), math.inf))
+    seen = light.radiance_along(torch.zeros(1, 3), wi, torch.full((1, 2_000_000), math.inf))
     irradiance = 2 * math.pi * (seen * wi[..., 2:]).mean(1)[0]
     torch.testing.assert_close(irradiance, 0.8 * torch.tensor([0.3, 0.6, 0.9]) + 0.2, rtol=0.05, atol=0.0)
 
@@ -63,16 +63,18 @@ def test_a_lamp_with_an_axis_emits_by_the_cosine_and_not_backwards():
     expected = full * torch.tensor([1.0, 0.5, 0.0])[:, None].expand(3, 3)
     torch.testing.assert_close(light.arriving(light.rays_from(x))[:, 0], expected, atol=1e-4, rtol=1e-5)
     infinite = torch.full((3, 1), math.inf)
-    torch.testing.assert_close(light.met(x, -x[:, None] / 2, infinite)[:, 0], expected, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(
+        light.radiance_along(x, -x[:, None] / 2, infinite)[:, 0], expected, atol=1e-4, rtol=1e-5
+    )
 
 
 def test_a_closer_surface_occludes_a_lamp():
     light = lamps()
     up = torch.tensor([[[0.0, 0.0, 1.0]]])
     x = torch.zeros(1, 3)
-    assert light.met(x, up, torch.tensor([[0.5]])).sum() == 0
-    assert light.met(x, up, torch.tensor([[2.0]])).sum() > 0
-    assert light.met(x, -up, torch.tensor([[math.inf]])).sum() == 0
+    assert light.radiance_along(x, up, torch.tensor([[0.5]])).sum() == 0
+    assert light.radiance_along(x, up, torch.tensor([[2.0]])).sum() > 0
+    assert light.radiance_along(x, -up, torch.tensor([[math.inf]])).sum() == 0
 
 
 def test_a_point_inside_a_lamp_gets_finite_light():

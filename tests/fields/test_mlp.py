@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.fields.mlp import Mlp, weight_normalise_
+from neilfpp_method.fields.mlp import Mlp, weight_normalize_
 
 SHAPES = [("softplus", None), ("softplus", 2), ("relu", 1), ("sine", 3), ("sine", 2)]
 
@@ -15,7 +15,7 @@ SHAPES = [("softplus", None), ("softplus", 2), ("relu", 1), ("sine", 3), ("sine"
 def network(activation: str, skip: int | None) -> Mlp:
     torch.manual_seed(0)
     mlp = Mlp(5, 4, layers=3, width=8, activation=activation, skip=skip)
-    weight_normalise_(mlp)
+    weight_normalize_(mlp)
     return mlp.double()
 
 
@@ -79,11 +79,11 @@ def test_sine_layers_keep_their_distribution():
         assert hidden.std().item() == pytest.approx(np.sqrt(0.5), rel=0.1)
 
 
-def test_weight_normalisation_keeps_the_function():
+def test_weight_normalization_keeps_the_function():
     torch.manual_seed(0)
     mlp = Mlp(5, 4, layers=3, width=8, activation="softplus").double()
     before = mlp(inputs())
-    weight_normalise_(mlp)
+    weight_normalize_(mlp)
     torch.testing.assert_close(mlp(inputs()), before)
     assert sum(p.numel() for p in mlp.parameters()) == (5 * 8 + 2 * 8 * 8 + 8 * 4) + 2 * (3 * 8 + 4)
 

@@ -8,6 +8,7 @@ import torch
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig, SdfConfig
+from tests.scenes import positions
 
 GRID = HashGridConfig(levels=3, sdf_log2_entries=9, max_resolution=32)
 SMALL = {
@@ -25,12 +26,6 @@ def worn_in(encoding: str, noise: float = 0.1) -> SdfField:
         for parameter in field.parameters():
             parameter += noise * torch.randn_like(parameter)
     return field
-
-
-def positions(count: int = 8) -> torch.Tensor:
-    return torch.empty(count, 3, dtype=torch.float64).uniform_(
-        -1, 1, generator=torch.Generator().manual_seed(1)
-    )
 
 
 @pytest.mark.parametrize("name", ["paper-mlp", "paper-ngp", "fast"])

@@ -68,7 +68,7 @@ class KnownBall:
 
     Attributes:
         environment: the map (H, W, 3), linear radiance.
-        base_color: unit normals (N, 3) to base color (N, 3).
+        base_color: unit normals (N, 3) to base colour (N, 3).
         roughness, metallic: the same at every point.
     """
 

@@ -17,13 +17,13 @@ STEPS, CLOSE = 128, 1e-5
 LIGHT = np.array([0.48, 0.6, 0.64])
 
 
-def box(x: Array, half: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Array:
-    beyond = np.abs(x - np.array(centre)) - np.array(half)
+def box(x: Array, half: tuple[float, float, float], center: tuple[float, float, float] = (0, 0, 0)) -> Array:
+    beyond = np.abs(x - np.array(center)) - np.array(half)
     return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
 
 
-def ball(x: Array, radius: float, centre: tuple[float, float, float] = (0, 0, 0)) -> Array:
-    return np.linalg.norm(x - np.array(centre), axis=-1) - radius
+def ball(x: Array, radius: float, center: tuple[float, float, float] = (0, 0, 0)) -> Array:
+    return np.linalg.norm(x - np.array(center), axis=-1) - radius
 
 
 def plate(x: Array) -> Array:

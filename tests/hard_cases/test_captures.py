@@ -14,27 +14,10 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
+from tests.data.formats.scenes import refused
 from tests.data.make_capture import make_capture
 
 FLAT = np.full((18, 24, 3), 0.5, np.float32)
-
-
-def load_pixels(root: Path, **options) -> PixelDataset:
-    capture = load_capture(root, **options)
-    return PixelDataset(capture, capture.views)
-
-
-def refused(root: Path, *words: str, **options) -> None:
-    """Check that loading the capture and its pixels raises a one-line `UserError` with a remedy that has all
-    these words.
-    """
-    with pytest.raises(UserError) as caught:
-        load_pixels(root, **options)
-    message = str(caught.value)
-    assert "\n" not in message
-    assert caught.value.remedy
-    for word in words:
-        assert word in message
 
 
 # ---------------------------------------------------------------------------------------------------- folders

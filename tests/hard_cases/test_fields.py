@@ -104,7 +104,7 @@ def test_incident_light(name, dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
-def test_background_from_the_centre_and_from_the_rim(name, dtype):
+def test_background_from_the_center_and_from_the_rim(name, dtype):
     """Rays from the origin, along a radius, along a tangent, and from a hair outside the sphere."""
     torch.manual_seed(0)
     field = InvertedSphere(

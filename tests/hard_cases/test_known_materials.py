@@ -164,7 +164,7 @@ def gold(n: Array) -> Array:
     return np.broadcast_to([0.95, 0.7, 0.4], n.shape)
 
 
-def grey(value: float):
+def gray(value: float):
     return lambda n: np.full_like(n, value)
 
 
@@ -182,11 +182,11 @@ PAINT = KnownBall()
 PAINT_BOUNDS = {"base_color": 0.02, "roughness": 0.04, "metallic": 0.08, "image": 0.06}
 QUICK = {
     "mirror": Case(
-        KnownBall(roughness=0.08, metallic=1.0, base_color=grey(0.9)),
+        KnownBall(roughness=0.08, metallic=1.0, base_color=gray(0.9)),
         {"base_color": 0.012, "roughness": 0.1, "metallic": 0.02, "image": 0.04},
     ),
     "white on white": Case(
-        KnownBall(EVEN, roughness=0.7, base_color=grey(0.9)), {"base_color": 0.06, "image": 0.012}
+        KnownBall(EVEN, roughness=0.7, base_color=gray(0.9)), {"base_color": 0.06, "image": 0.012}
     ),
     "over-exposed LDR": Case(
         dataclasses.replace(PAINT, environment=3.0 * sky()),
@@ -206,11 +206,11 @@ LONG = {
         {"scaled_base_color": 0.04, "roughness": 0.07, "metallic": 0.22, "image": 0.06},
     ),
     "soot": Case(
-        KnownBall(roughness=0.9, base_color=grey(0.02)),
+        KnownBall(roughness=0.9, base_color=gray(0.02)),
         {"base_color": 0.015, "roughness": 0.07, "image": 0.07},
     ),
     "black": Case(
-        KnownBall(roughness=0.5, base_color=grey(0.0)), {"base_color": 0.03, "roughness": 0.02, "image": 0.13}
+        KnownBall(roughness=0.5, base_color=gray(0.0)), {"base_color": 0.03, "roughness": 0.02, "image": 0.13}
     ),
     "LDR": Case(
         PAINT,
@@ -230,7 +230,7 @@ LONG = {
         PAINT, {"scaled_base_color": 0.19, "roughness": 0.25, "image": 0.11}, {"known_light": False}
     ),
     "white on white, light not known": Case(
-        KnownBall(EVEN, roughness=0.7, base_color=grey(0.9)),
+        KnownBall(EVEN, roughness=0.7, base_color=gray(0.9)),
         {"scaled_base_color": 0.01, "image": 0.04},
         {"known_light": False},
     ),

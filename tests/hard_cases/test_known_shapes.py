@@ -85,7 +85,11 @@ def learn(
     config, median = settings(), float(np.median(seen.color[seen.hit].mean(-1)))
     torch.manual_seed(0)
     model = NeilfModel(
-        VolSdfHost(config, 1.5, "constant", points=None if flipped is None else cloud(seen, flipped)),
+        VolSdfHost(
+            config,
+            SceneFacts("linear", 0.2, 1.5, "constant"),
+            points=None if flipped is None else cloud(seen, flipped),
+        ),
         config,
         SceneFacts("linear", median, 1.5, "constant"),
     )

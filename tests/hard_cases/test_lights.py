@@ -66,7 +66,7 @@ def test_lamps_hit_by_directions(dtype, intensity):
     x = BESIDE.to(dtype)
     rays = lamps.rays_from(x)
     assert_bounded(rays.wi, rays.samples().pdf, lamps.arriving(rays), bound=1e10)
-    seen = lamps.met(x, rays.wi, torch.full(rays.wi.shape[:2], math.inf, dtype=dtype))
+    seen = lamps.radiance_along(x, rays.wi, torch.full(rays.wi.shape[:2], math.inf, dtype=dtype))
     assert_bounded(seen, bound=1e10)
     assert (seen[2].max() > 0) == (intensity > 0)
 

@@ -311,7 +311,7 @@ def test_gradients_of_residuals_point_to_the_pixel(response, dtype, radiance, st
     st.floats(0.2, 20.0),
     arrays(np.float64, 2, elements=st.floats(-0.5, 1.5)),
 )
-def test_rays_project_back_to_their_pixels(dtype, uv, log_scale, away, focal, centre):
+def test_rays_project_back_to_their_pixels(dtype, uv, log_scale, away, focal, center):
     """A camera of any focal length, in scenes of any unit and position, in the scene frame."""
     forward, aside = direction(uv, torch.float64)[:2].numpy()
     right = np.cross(forward, aside)
@@ -323,7 +323,7 @@ def test_rays_project_back_to_their_pixels(dtype, uv, log_scale, away, focal, ce
     scale = 10.0**log_scale
     middle = away * scale * np.array([0.6, 0.0, -0.8])
     w2c[:3, 3] = -w2c[:3, :3] @ (middle - 3.0 * scale * forward)
-    camera = Camera(8 * focal, 8 * focal, *(8 * centre), 8, 6, w2c)
+    camera = Camera(8 * focal, 8 * focal, *(8 * center), 8, 6, w2c)
     scene = Normalisation(scale, tuple(middle)).camera(camera)
     rays = camera_rays(scene, dtype)
     assert_finite(rays.origins, bound=3.1)

@@ -18,7 +18,7 @@ from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.loop import train
-from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
+from tests.data.make_capture import CENTER, RADIUS, SCALE, make_capture, srgb
 from tests.train.small_runs import small_config, small_training, solved_light
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
@@ -83,10 +83,12 @@ def environment(direction: np.ndarray) -> np.ndarray:
     return 50.0 * lamp[:, None] + 0.2 * (1.1 + direction)
 
 
-def test_a_perfect_mirror(tmp_path):
-    def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
-        return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
+def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
+    """The mirrored environment."""
+    return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
 
+
+def test_a_perfect_mirror(tmp_path):
     root = repaint(make_capture(tmp_path / "mirror", masks=True), mirror)
     assert max(read_image(view.image).pixels.max() for view in load_capture(root).views) > 10.0
     trains(root, tmp_path / "run")
@@ -132,9 +134,6 @@ odd = {"steps": 12, "solved": True, "may_rest": frozenset({"light"})}
 
 
 def test_a_mirror_under_a_fitted_light(tmp_path):
-    def mirror(normal: np.ndarray, seen_along: np.ndarray) -> np.ndarray:
-        return environment(seen_along - 2.0 * (seen_along * normal).sum(-1, keepdims=True) * normal)
-
     trains(repaint(make_capture(tmp_path / "mirror", masks=True), mirror), tmp_path / "run", **odd)
 
 
@@ -172,7 +171,7 @@ def test_cameras_inside_the_object(tmp_path, solved):
     scene = json.loads(path.read_text())
     for k, track in scene["camera_track_map"]["images"].items():
         w2c = np.reshape(track["camera"]["extrinsic"], (4, 4))
-        eye = CENTRE - 0.2 * RADIUS * w2c[2, :3]
+        eye = CENTER - 0.2 * RADIUS * w2c[2, :3]
         w2c[:3, 3] = -w2c[:3, :3] @ eye
         track["camera"]["extrinsic"] = w2c.tolist()
         image = root / "inputs" / "images" / f"{int(k):03d}.exr"

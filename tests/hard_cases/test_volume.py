@@ -6,16 +6,14 @@ import pytest
 import torch
 
 from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.compositing import composite, render_weights
 from neilfpp_method.volume.density import laplace_density
-from neilfpp_method.volume.intersect import sphere_interval
+from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples, inverse_cdf_samples
+from tests.scenes import sphere_distance
 
 CONFIG = VolumeConfig(initial_samples=16, samples=8)
-
-
-def sphere(x):
-    return x.norm(dim=-1) - 0.6
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -59,7 +57,7 @@ def test_sampler(beta, stochastic, dtype):
     interval = sphere_interval(origins, directions, 3.0)
     scale = torch.tensor(beta, dtype=dtype)
     found = error_bounded_samples(
-        sphere, origins, directions, interval.near, interval.far, scale, CONFIG, stochastic
+        sphere_distance, RayBatch(origins, directions), interval, scale, CONFIG, stochastic
     )
     assert found.distances.dtype == dtype
     assert found.distances.isfinite().all()
@@ -77,10 +75,8 @@ def test_sampler_with_a_constant_sdf(constant):
     far = torch.tensor([0.0, 3.0])
     found = error_bounded_samples(
         lambda x: torch.full_like(x[:, 0], constant),
-        origins,
-        directions,
-        torch.zeros(2),
-        far,
+        RayBatch(origins, directions),
+        Interval(torch.zeros(2), far),
         torch.tensor(1e-4),
         CONFIG,
         False,
@@ -92,11 +88,9 @@ def test_sampler_with_a_constant_sdf(constant):
 def test_sampler_takes_a_half_precision_sdf():
     origins, directions = torch.tensor([[-2.0, 0.0, 0.0]]), torch.tensor([[1.0, 0.0, 0.0]])
     found = error_bounded_samples(
-        lambda x: sphere(x).bfloat16(),
-        origins,
-        directions,
-        torch.tensor([0.0]),
-        torch.tensor([4.0]),
+        lambda x: sphere_distance(x).bfloat16(),
+        RayBatch(origins, directions),
+        Interval(torch.tensor([0.0]), torch.tensor([4.0])),
         torch.tensor(0.01),
         CONFIG,
         False,
@@ -116,8 +110,7 @@ def test_inverse_cdf_of_a_uniform_mass_is_uniform(mass, span):
 
 def test_an_empty_batch_of_rays():
     empty = torch.zeros(0)
-    found = error_bounded_samples(
-        sphere, torch.zeros(0, 3), torch.zeros(0, 3), empty, empty, torch.tensor(0.1), CONFIG, True
-    )
+    rays, interval = RayBatch(torch.zeros(0, 3), torch.zeros(0, 3)), Interval(empty, empty)
+    found = error_bounded_samples(sphere_distance, rays, interval, torch.tensor(0.1), CONFIG, True)
     assert found.distances.shape == (0, 8)
     assert found.sdf_queries == 0

@@ -80,7 +80,7 @@ def test_ten_in_a_row_end_the_training_and_nine_do_not():
         step(guard, optimizers, one.sum() * torch.nan)
 
 
-def test_an_optimiser_watched_twice_is_checked_once():
+def test_an_optimizer_watched_twice_is_checked_once():
     one, _, optimizers = two_fields()
     guard, said = guarded([*optimizers, *optimizers])
     step(guard, optimizers, one.sum() * torch.nan)

@@ -15,7 +15,7 @@ from neilfpp_method.schedule import STAGES, Stage
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import PixelBatch, SurfaceHits
 from neilfpp_method.train.health_record import read_findings, write_findings
-from neilfpp_method.train.run import write_json
+from neilfpp_method.train.json_files import write_json
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 

@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.structures import RayBatch
 
-CENTRE, RADIUS = (0.1, 0.0, 0.05), 0.35
+CENTER, RADIUS = (0.1, 0.0, 0.05), 0.35
 TABLE, REACH = -0.3, 0.9
 """Height of the table, and its radius."""
 
@@ -23,10 +23,10 @@ class TableTop:
 
     def meet(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
         """The distance to the first surface, infinite without a hit."""
-        centre = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, self.lift])
-        from_centre = origins - centre
-        middle = -(from_centre * directions).sum(-1)
-        square = middle.square() - from_centre.square().sum(-1) + RADIUS**2
+        center = torch.tensor(CENTER) + torch.tensor([0.0, 0.0, self.lift])
+        from_center = origins - center
+        middle = -(from_center * directions).sum(-1)
+        square = middle.square() - from_center.square().sum(-1) + RADIUS**2
         near = middle - square.clamp_min(0).sqrt()
         ball = torch.where((square > 0) & (near > 1e-4), near, torch.inf)
         down = (TABLE + self.lift - origins[:, 2]) / directions[:, 2]
@@ -40,10 +40,10 @@ class TableTop:
         distance = self.meet(origins, directions)
         hit = distance.isfinite()
         position = origins + torch.where(hit, distance, 0.0)[:, None] * directions
-        centre = torch.tensor(CENTRE) + torch.tensor([0.0, 0.0, self.lift])
-        on_ball = (position - centre).norm(dim=-1) < RADIUS + 1e-3
+        center = torch.tensor(CENTER) + torch.tensor([0.0, 0.0, self.lift])
+        on_ball = (position - center).norm(dim=-1) < RADIUS + 1e-3
         normal = torch.where(
-            on_ball[:, None], normalize(position - centre, dim=-1), torch.tensor([0.0, 0.0, 1.0])
+            on_ball[:, None], normalize(position - center, dim=-1), torch.tensor([0.0, 0.0, 1.0])
         )
         color = torch.where(on_ball[:, None], torch.tensor([0.6, 0.1, 0.1]), torch.tensor([0.2, 0.3, 0.4]))
         return color * hit[:, None], position, normal * hit[:, None]

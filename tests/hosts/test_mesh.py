@@ -25,7 +25,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import RayBatch
-from tests.data.make_capture import CENTRE, make_capture
+from tests.data.make_capture import CENTER, make_capture
 from tests.scenes import sphere_batch, tiny_config
 from tests.train.small_runs import small_config
 
@@ -39,9 +39,13 @@ def mesh_config(**changes) -> NeilfConfig:
     return dataclasses.replace(fixed_geometry(tiny_config()), **changes)
 
 
+def mesh_facts() -> SceneFacts:
+    return SceneFacts("linear", 0.2, 3.0, "constant", background_color=(0.25, 0.5, 0.75))
+
+
 def mesh_host(shape: trimesh.Trimesh, **changes) -> MeshHost:
     torch.manual_seed(0)
-    return MeshHost(mesh_of(shape), mesh_config(**changes), 3.0, background_color=(0.25, 0.5, 0.75))
+    return MeshHost(mesh_of(shape), mesh_config(**changes), mesh_facts())
 
 
 def rays_at(count: int, spread: float, seed: int = 0, dtype: torch.dtype = torch.float32) -> RayBatch:
@@ -105,7 +109,7 @@ def test_a_miss_has_the_background_color_and_no_normal(tracer):
 
 def test_an_open_background_is_rendered_behind_the_mesh():
     torch.manual_seed(0)
-    host = MeshHost(mesh_of(SPHERE), mesh_config(), 3.0, background="inverted_sphere")
+    host = MeshHost(mesh_of(SPHERE), mesh_config(), SceneFacts("linear", 0.2, 3.0, "inverted_sphere"))
     rays = rays_at(100, 0.9)
     hits = host.render(rays)
     beyond = host.background(rays.origins, rays.directions)
@@ -356,7 +360,7 @@ def test_a_mesh_is_given_by_its_path_and_loaded_again(tmp_path: Path, monkeypatc
     shape = trimesh.load_mesh(tmp_path / "scan.ply", process=False)
     trimesh.Trimesh(shape.vertices, shape.faces[:, ::-1], process=False).export(tmp_path / "inside.ply")
     assert "see the inside" in error("--host", "mesh", "--mesh", str(tmp_path / "inside.ply"))
-    trimesh.Trimesh(shape.vertices - CENTRE + 90.0, shape.faces, process=False).export(tmp_path / "away.ply")
+    trimesh.Trimesh(shape.vertices - CENTER + 90.0, shape.faces, process=False).export(tmp_path / "away.ply")
     assert "no camera sees this mesh" in error("--host", "mesh", "--mesh", str(tmp_path / "away.ply"))
 
     out = tmp_path / "run"

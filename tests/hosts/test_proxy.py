@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.proxy import EVERY, SurfaceProxy
 from neilfpp_method.structures import RayBatch, SceneLight
-from tests.hosts.table import CENTRE, RADIUS, TableTop, camera_rays_above
+from tests.hosts.table import CENTER, RADIUS, TableTop, camera_rays_above
 
 SCENE, CELLS = 1.75, 96
 
@@ -22,7 +22,7 @@ def gathered(host: TableTop, steps: int = 20, proxy: SurfaceProxy | None = None)
     if proxy is None:
         proxy = SurfaceProxy(SCENE, CELLS, 0.8)
         rays = camera_rays_above(512, seed=1000)
-        proxy.look_around(adapted.render, rays, adapted.render(rays))
+        proxy.explore(adapted.render, rays, adapted.render(rays))
     for step in range(steps):
         rays = camera_rays_above(512, seed=step)
         proxy.observe(rays, adapted.render(rays))
@@ -85,9 +85,9 @@ def test_incident_light_is_the_observed_radiance(still):
     found = compare(TableTop(), still)
     both = found.told.hit & found.true.isfinite()
     place = (found.position[:, None] + found.true[..., None] * found.wi)[both]
-    from_centre = (place - torch.tensor(CENTRE)).norm(dim=-1)
+    from_center = (place - torch.tensor(CENTER)).norm(dim=-1)
     radiance = found.told.radiance[both]
-    ball, table = from_centre < RADIUS + 1e-3, from_centre > RADIUS + 3 * still.cell
+    ball, table = from_center < RADIUS + 1e-3, from_center > RADIUS + 3 * still.cell
     assert (radiance[ball] - torch.tensor([0.6, 0.1, 0.1])).abs().mean(0).max() < 0.03
     assert (radiance[table] - torch.tensor([0.2, 0.3, 0.4])).abs().mean(0).max() < 0.03
     assert not found.told.radiance[~found.told.hit].any()
@@ -162,7 +162,7 @@ def test_a_checkpoint_between_two_refreshes_loses_no_ray():
 def test_the_radiance_method_of_a_host_is_used():
     proxy = SurfaceProxy(SCENE, CELLS, 0.8, radiance=lambda x, wo: wo.abs())
     adapted, rays = CallableHost(TableTop()), camera_rays_above(512)
-    proxy.look_around(adapted.render, rays, adapted.render(rays))
+    proxy.explore(adapted.render, rays, adapted.render(rays))
     light = proxy.scene_light(torch.tensor([[0.1, 0.0, -0.3]]), torch.tensor([[[0.0, 0.0, 1.0]]]))
     torch.testing.assert_close(light.radiance[0, 0], torch.tensor([0.0, 0.0, 1.0]))
 

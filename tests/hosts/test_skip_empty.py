@@ -10,6 +10,7 @@ import torch
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.incident import traced
 from neilfpp_method.incident.traced import trace_light
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.volume import empty_space
 from tests.scenes import sphere_batch, tiny_config
 
@@ -19,8 +20,7 @@ def host(skip: bool = True) -> VolSdfHost:
     config = tiny_config()
     return VolSdfHost(
         dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip)),
-        3.0,
-        "constant",
+        SceneFacts("linear", 0.2, 3.0, "constant"),
     )
 
 

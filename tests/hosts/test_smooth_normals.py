@@ -8,7 +8,7 @@ import math
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.hosts.smooth_normals import NEIGHBOURS, smooth_normals
+from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 RADIUS = 0.15
@@ -67,9 +67,9 @@ def test_an_empty_batch_of_points():
     assert smooth_normals(lambda x: x, none, none, RADIUS).shape == (0, 3)
 
 
-def test_a_radius_of_zero_evaluates_no_neighbours():
+def test_a_radius_of_zero_evaluates_no_neighbors():
     config = tiny_config()
-    for radius, expected in ((0.0, 0), (RADIUS, NEIGHBOURS)):
+    for radius, expected in ((0.0, 0), (RADIUS, NEIGHBORS)):
         model = sphere_model(
             dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=radius))
         )

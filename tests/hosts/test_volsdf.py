@@ -12,11 +12,13 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import OrientedPoints, RayBatch
 from neilfpp_method.volume.density import laplace_density
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
+FACTS = SceneFacts("linear", 0.2, 3.0, "constant")
 RADIUS = 0.6
 
 
@@ -125,7 +127,7 @@ def test_only_the_named_losses_are_computed(sharp):
     assert sharp.render_regularised(batch, []).terms == {}
 
 
-def test_regularisers_cover_the_whole_scene():
+def test_regularizers_cover_the_whole_scene():
     """For G = c · x the losses are known at every point, so their means and counts show which points are
     used.
     """
@@ -173,9 +175,7 @@ def test_a_mask_removes_a_solid_in_empty_space(background):
 def test_the_loss_of_a_point_cloud_is_its_distance():
     direction = normalize(torch.randn(64, 3), dim=-1)
     for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.3, 0.3)):
-        host = VolSdfHost(
-            tiny_config(), 3.0, "constant", points=OrientedPoints(radius * direction, direction)
-        )
+        host = VolSdfHost(tiny_config(), FACTS, points=OrientedPoints(radius * direction, direction))
         term = host.render_regularised(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
         assert term.mean().item() == pytest.approx(expected, abs=0.15)  # the field starts as a rough sphere
 

@@ -168,7 +168,7 @@ def test_scale(capture: Capture) -> None:
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 3))
     for size, severity in ((2.0, "problem"), (0.05, "warning")):
-        points = np.array(capture.normalisation.centre) + capture.normalisation.scale * size * rng.uniform(
+        points = np.array(capture.normalisation.center) + capture.normalisation.scale * size * rng.uniform(
             -1, 1, (500, 3)
         )
         write_ply(capture.root / "cloud.ply", points, normal)

@@ -44,9 +44,9 @@ def test_luminance_and_range_are_linear_and_of_the_object(view: View) -> None:
     assert measured.stops == pytest.approx(8 * (0.999 - 0.01), abs=0.05)
     assert measured.pixels == 800
     assert figures(view, pixels, exposure=4.0).luminance == pytest.approx(np.exp2(-3), rel=0.01)
-    grey = np.full((HEIGHT, WIDTH, 3), 0.0)
-    grey[20:40, 20:60] = 186 / 255
-    assert figures(view, grey, hdr=False).luminance == pytest.approx(0.491, abs=0.002)  # of the sRGB curve
+    gray = np.full((HEIGHT, WIDTH, 3), 0.0)
+    gray[20:40, 20:60] = 186 / 255
+    assert figures(view, gray, hdr=False).luminance == pytest.approx(0.491, abs=0.002)  # of the sRGB curve
 
 
 def test_luminance_follows_the_exposure_and_hardly_the_content(view: View) -> None:

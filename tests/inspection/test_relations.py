@@ -71,10 +71,10 @@ def test_coverage_by_cameras(tmp_path: Path) -> None:
     placement = camera_placement(capture)
     assert not placement.away.any()
     assert not placement.within.any()
-    assert np.allclose(np.linalg.norm(placement.centres, axis=1), DISTANCE / SCALE)
+    assert np.allclose(np.linalg.norm(placement.centers, axis=1), DISTANCE / SCALE)
     assert np.allclose(
         placement.axes,
-        -placement.centres / np.linalg.norm(placement.centres, axis=1, keepdims=True),
+        -placement.centers / np.linalg.norm(placement.centers, axis=1, keepdims=True),
         atol=1e-9,
     )
     one = camera_placement(replace(capture, views=capture.views[:1]))

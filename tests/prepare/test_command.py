@@ -58,18 +58,18 @@ def to_truth(capture, poses: dict[str, np.ndarray]):
     found = np.stack([view.camera.c2w[:, 3] for view in capture.views])
     true = np.stack([-poses[view.name][:3, :3].T @ poses[view.name][:3, 3] for view in capture.views])
     scale, rotation, shift = alignment(found, true)
-    centres = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
+    centers = np.linalg.norm(scale * found @ rotation.T + shift - true, axis=1)
     rotations = [
         angle(view.camera.w2c[:3, :3] @ rotation.T, poses[view.name][:3, :3]) for view in capture.views
     ]
-    return scale, rotation, shift, centres.max(), max(rotations)
+    return scale, rotation, shift, centers.max(), max(rotations)
 
 
 def test_the_camera_poses_are_accurate(prepared):
     capture = load_capture(prepared)
     assert len(capture.views) == VIEWS
-    _, rotation, _, centres, rotations = to_truth(capture, {f"{i:03}": pose(i, VIEWS) for i in range(VIEWS)})
-    assert centres < 0.005
+    _, rotation, _, centers, rotations = to_truth(capture, {f"{i:03}": pose(i, VIEWS) for i in range(VIEWS)})
+    assert centers < 0.005
     assert rotations < 0.2
     # The cameras are level, so the up direction of the world is known as well.
     assert rotation[2, 2] == pytest.approx(1.0, abs=1e-4)
@@ -387,9 +387,9 @@ def test_the_ring_is_placed_exactly(tmp_path):
     truth = json.loads((ring / "true_cameras.json").read_text())
     assert {view.name for view in capture.views} == set(truth)
     poses = {name: np.array(camera["w2c"]) for name, camera in truth.items()}
-    scale, _, _, centres, rotations = to_truth(capture, poses)
+    scale, _, _, centers, rotations = to_truth(capture, poses)
     assert len(capture.views) == 36
-    assert centres < 0.005 * scale * capture.normalisation.scale
+    assert centers < 0.005 * scale * capture.normalisation.scale
     assert rotations < 0.2
     assert (
         main(

@@ -9,7 +9,7 @@ import pytest
 from neilfpp_method.data.views import Camera, Normalisation
 from neilfpp_method.prepare.depth_fusion import fuse
 from neilfpp_method.prepare.depth_planes import fit_planes
-from neilfpp_method.prepare.plane_sweep import GreyView, choose_sources, inverse_depth_step, sweep
+from neilfpp_method.prepare.plane_sweep import GrayView, choose_sources, inverse_depth_step, sweep
 from tests.prepare.textured_corner import FOCAL, photograph, pose
 
 SIZE = (240, 180)
@@ -48,8 +48,8 @@ def picture(i: int) -> np.ndarray:
 
 
 def test_the_sweep_finds_the_depth_of_the_corner():
-    views = [GreyView(camera(pose(i, 9)), picture(i)) for i in range(9)]
-    sources = choose_sources([view.camera for view in views], np.array(BOX.centre), 4)[4]
+    views = [GrayView(camera(pose(i, 9)), picture(i)) for i in range(9)]
+    sources = choose_sources([view.camera for view in views], np.array(BOX.center), 4)[4]
     depth = sweep(views[4], [views[j] for j in sources], BOX)
     known = depth > 0
     assert known.mean() > 0.9
@@ -59,15 +59,15 @@ def test_the_sweep_finds_the_depth_of_the_corner():
     assert np.quantile(inverse, 0.9) < 0.5 * pixel
 
 
-def test_without_neighbours_or_texture_depth_is_unknown():
-    views = [GreyView(camera(pose(i, 9)), np.full(SIZE[::-1], 0.5, np.float32)) for i in range(3)]
+def test_without_neighbors_or_texture_depth_is_unknown():
+    views = [GrayView(camera(pose(i, 9)), np.full(SIZE[::-1], 0.5, np.float32)) for i in range(3)]
     assert not sweep(views[0], [], BOX).any()
     assert not sweep(views[0], views[1:], BOX).any()
 
 
 def test_sources_are_neither_too_close_nor_too_far():
     cameras = [camera(pose(i, 13, arc=240)) for i in range(13)]
-    chosen = choose_sources([*cameras, cameras[6]], np.array(BOX.centre), 3)
+    chosen = choose_sources([*cameras, cameras[6]], np.array(BOX.center), 3)
     assert 13 not in chosen[6]
     assert set(chosen[6]) <= {4, 5, 7, 8}
     assert chosen[0]
@@ -99,8 +99,8 @@ def test_depths_that_views_agree_on_are_fused_once():
     rng = np.random.default_rng(1)
     liar = rng.random(depths[3].shape) < 0.02
     depths[3] = np.where(liar, depths[3] * 0.8, depths[3]).astype(np.float32)
-    neighbours = [[j for j in range(7) if j != i] for i in range(7)]
-    points = fuse(cameras, depths, [0.01] * 7, neighbours, lambda: None)
+    neighbors = [[j for j in range(7) if j != i] for i in range(7)]
+    points = fuse(cameras, depths, [0.01] * 7, neighbors, lambda: None)
     assert 20_000 < len(points.position) < sum(depth.size for depth in depths) / 2
     distance = np.abs(points.position)
     assert np.median(distance.min(axis=1)) < 1e-3

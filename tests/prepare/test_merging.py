@@ -69,8 +69,8 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
     capture = load_capture(tmp_path / "out")
     assert capture.hdr
     assert [view.name for view in capture.views] == [f"{i:03}" for i in range(POSES)]
-    *_, centres, rotations = to_truth(capture, {f"{i:03}": pose(i, POSES) for i in range(POSES)})
-    assert centres < 0.01
+    *_, centers, rotations = to_truth(capture, {f"{i:03}": pose(i, POSES) for i in range(POSES)})
+    assert centers < 0.01
     assert rotations < 0.3
     scales = []
     for i, view in enumerate(capture.views):
@@ -92,21 +92,27 @@ def test_brackets_become_a_linear_capture(tmp_path: Path, capsys) -> None:
     assert "already finished" in capsys.readouterr().out
 
 
+def stop_after_two_merges(patch: pytest.MonkeyPatch) -> list[tuple]:
+    """Press Ctrl-C at the third merge; returns the list of the arguments of all merges before."""
+    merge, merges = bracket_folder.merge, []
+
+    def counted(*arguments):
+        if len(merges) == 2:
+            raise KeyboardInterrupt
+        merges.append(arguments)
+        return merge(*arguments)
+
+    patch.setattr(bracket_folder, "merge", counted)
+    return merges
+
+
 def test_handheld_brackets_are_reported_also_after_a_stop(tmp_path: Path, monkeypatch) -> None:
     for p in range(3):
         for i, time in enumerate((1 / 32, 1 / 10, 1 / 3)):
             write(tmp_path / "photos" / f"{p}_{i}.png", np.roll(radiance(p), 3 * i if p else 0, axis=1), time)
     photos = survey(tmp_path / "photos", "auto")
-    merge, seen = bracket_folder.merge, []
-
-    def counted(*arguments):
-        if len(seen) == 2:
-            raise KeyboardInterrupt
-        seen.append(arguments)
-        return merge(*arguments)
-
     with monkeypatch.context() as patch:
-        patch.setattr(bracket_folder, "merge", counted)
+        stop_after_two_merges(patch)
         with pytest.raises(KeyboardInterrupt):
             merged(photos, tmp_path / "merged")
     done = merged(photos, tmp_path / "merged")
@@ -122,21 +128,13 @@ def merged(photos: Photos, folder: Path):
 
 def test_a_stopped_merge_continues_and_repeats_nothing(tmp_path: Path, monkeypatch) -> None:
     photos = survey(plain(tmp_path / "photos", [TIMES] * 4), "auto")
-    merge, seen = bracket_folder.merge, []
-
-    def counted(*arguments):
-        if len(seen) == 2:
-            raise KeyboardInterrupt
-        seen.append(arguments)
-        return merge(*arguments)
-
-    monkeypatch.setattr(bracket_folder, "merge", counted)
+    merges = stop_after_two_merges(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         merged(photos, tmp_path / "merged")
     kept = (tmp_path / "merged" / "images" / "0.exr").stat().st_mtime_ns
-    seen.clear()
+    merges.clear()
     done = merged(photos, tmp_path / "merged")
-    assert len(seen) == 2
+    assert len(merges) == 2
     assert (tmp_path / "merged" / "images" / "0.exr").stat().st_mtime_ns == kept
     monkeypatch.setattr(bracket_folder, "_response", None)
     assert merged(photos, tmp_path / "merged").photos == done.photos

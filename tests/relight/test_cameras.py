@@ -72,7 +72,7 @@ def test_views_keep_their_size_up_to_a_width(capture):
         view_shots(capture, (), None, None)
 
 
-def test_a_turntable_is_a_circle_around_the_centre(capture):
+def test_a_turntable_is_a_circle_around_the_center(capture):
     shots = turntable(capture, 8, None, None)
     assert [shot.name for shot in shots][:2] == ["turn_0000", "turn_0001"]
     eyes = np.stack([shot.camera.c2w[:, 3] for shot in shots])

@@ -16,45 +16,25 @@ from neilfpp_method.commands.command import Command
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.relight import command
 from neilfpp_method.relight.lamplight import Lamplight
-from neilfpp_method.settings.presets import PRESETS
-from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config, solved_light
+from tests.calls import train_tiny
+from tests.train.small_runs import few_steps, solved_light
 
 FEW = ("--spp", "4", "--resolution", "32", "--device", "cpu")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _presets():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", lambda: small_config(sdf_steps=2, material_steps=3, joint_steps=1))
-        patch.setitem(
-            PRESETS,
-            "tiny_map",
-            lambda: solved_light(small_config(sdf_steps=2, material_steps=3, joint_steps=1)),
-        )
-        yield
-
-
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
-
-
-def trained(folder: Path, capture: Path, *options: str) -> Path:
-    assert main(["train", "--data", str(capture), "--out", str(folder), "--device", "cpu", *options]) == 0
-    return folder
-
-
-@pytest.fixture(scope="module")
-def found(tmp_path_factory, capture) -> Path:
+def found(tmp_path_factory, masked_capture) -> Path:
     """A run with a recovered surface and an environment map."""
-    return trained(tmp_path_factory.mktemp("runs") / "found", capture, "--preset", "tiny_map")
+    out = tmp_path_factory.mktemp("runs") / "found"
+    return train_tiny(masked_capture, out, config=lambda: solved_light(few_steps()))
 
 
 @pytest.fixture(scope="module")
-def given(tmp_path_factory, capture) -> Path:
+def given(tmp_path_factory, masked_capture) -> Path:
     """A run with the capture's mesh and a light that is free at every point."""
-    return trained(tmp_path_factory.mktemp("runs") / "given", capture, "--preset", "tiny", "--host", "mesh")
+    return train_tiny(
+        masked_capture, tmp_path_factory.mktemp("runs") / "given", "--host", "mesh", config=few_steps
+    )
 
 
 @pytest.fixture(scope="module")

@@ -86,9 +86,9 @@ def test_other_types_of_files(tmp_path):
     # sRGB 188/255 is half of the light of white.
     np.testing.assert_allclose(read_map(tmp_path / "sun.png", "ours").sky.radiance, 0.5, atol=0.005)
     write_exr(tmp_path / "grey.exr", {"Y": radiance[..., 0]})
-    grey = read_map(tmp_path / "grey.exr", "ours").sky.radiance
-    assert grey.shape == (16, 32, 3)
-    assert (grey[..., 0] == grey[..., 2]).all()
+    gray = read_map(tmp_path / "grey.exr", "ours").sky.radiance
+    assert gray.shape == (16, 32, 3)
+    assert (gray[..., 0] == gray[..., 2]).all()
 
 
 def spoiled(value: float) -> np.ndarray:

@@ -73,7 +73,7 @@ def test_the_mean_weight_is_the_directional_albedo(name, roughness, metallic, co
     assert weight.max() < 12  # ten for the least share of a technique
 
 
-def test_the_weight_of_a_lambertian_surface_is_its_colour():
+def test_the_weight_of_a_lambertian_surface_is_its_color():
     points = at(1000, None, 0.5, 0.9)
     wi = scatter(points, torch.rand(1000, 3), None)
     weight = brdf_cosine(points, wi, None) / scattering_pdf(points, wi, None)[:, None]

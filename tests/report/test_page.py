@@ -22,9 +22,9 @@ from neilfpp_method.report.files import changed_settings, read_files
 from neilfpp_method.report.markup import Html, data_block, element
 from neilfpp_method.report.write import ReportOptions, write_report
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.presets import PRESETS, fixed_geometry, preset
+from neilfpp_method.settings.presets import fixed_geometry, preset
+from tests.calls import train_tiny
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config
 
 HOSTILE = '"><script>alert(1)<&script>'
 SMALL = ReportOptions(views=1, size=24)
@@ -56,20 +56,11 @@ class Page(HTMLParser):
             self.text += data
 
 
-def train(capture: Path, out: Path, *options: str) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", small_config)
-        command = ["train", "--data", str(capture), "--out", str(out), "--preset", "tiny", "--device", "cpu"]
-        assert main([*command, *options]) == 0
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
     """A run of a capture with a hostile name; `train` has written its page."""
     root = make_capture(tmp_path_factory.mktemp("captures") / HOSTILE, masks=True)
-    out = tmp_path_factory.mktemp("runs") / "run"
-    train(root, out)
-    return out
+    return train_tiny(root, tmp_path_factory.mktemp("runs") / "run")
 
 
 @pytest.fixture
@@ -264,7 +255,7 @@ def test_photographs_without_truth_or_test_views_have_a_page(tmp_path: Path):
     root = make_capture(tmp_path / "photos", hdr=False, test=None)
     for part in ("inputs/depth_maps", "inputs/normal_maps", "ground_truths"):
         shutil.rmtree(root / part, ignore_errors=True)
-    train(root, tmp_path / "run", "--test-every", "0", "--no-report")
+    train_tiny(root, tmp_path / "run", "--test-every", "0", "--no-report")
     assert not (tmp_path / "run" / "report.html").exists()
     page = page_of(tmp_path / "run")
     for words in ("display values (LDR)", "No view is held out", "Nothing was measured"):
@@ -279,7 +270,7 @@ def test_a_given_mesh_has_its_page(tmp_path: Path):
     mesh = root / "inputs" / "model" / "mesh.ply"
     if not mesh.is_file():
         pytest.fail("the capture has no mesh to give")
-    train(root, tmp_path / "run", "--host", "mesh", "--no-report")
+    train_tiny(root, tmp_path / "run", "--host", "mesh", "--no-report")
     packed = page_of(tmp_path / "run").data["surface-data"]
     assert packed["faces"] > 10_000  # divided, for its colours
     low, high = np.array(packed["low"]), np.array(packed["high"])

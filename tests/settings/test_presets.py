@@ -24,9 +24,7 @@ def test_a_step_of_every_stage(name):
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=1e-3))
     facts = SceneFacts("linear", 0.2, 3.0, "constant", log_gains=(0.1, 0.0, 0.0, -0.1, 0.0, 0.0))
     direction = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
-    host = VolSdfHost(
-        config, facts.radiance_scale, facts.background, points=OrientedPoints(0.6 * direction, direction)
-    )
+    host = VolSdfHost(config, facts, points=OrientedPoints(0.6 * direction, direction))
     model = NeilfModel(host, config, facts)
     batch = sphere_batch(6, spread=0.3)
     for stage in Stage:

@@ -19,7 +19,7 @@ class Clock:
     def __call__(self) -> float:
         return self.time
 
-    def synchronise(self) -> None:
+    def synchronize(self) -> None:
         self.waits += 1
         self.time, self.lag = self.time + self.lag, 0.0
 
@@ -87,7 +87,7 @@ def test_a_device_is_sampled_and_its_time_is_divided():
     step, 2 s in a fit.
     """
     clock, steps = Clock(), EVERY + FIRST + 1
-    with recording(Ledger(synchronise=clock.synchronise, now=clock)) as ledger:
+    with recording(Ledger(synchronize=clock.synchronize, now=clock)) as ledger:
         ledger.enter("joint")
         for number in range(steps):
             with ledger.step(number):
@@ -96,10 +96,10 @@ def test_a_device_is_sampled_and_its_time_is_divided():
                 with timed("shading"):
                     clock.lag += 1.0
                 if number == 5:
-                    clock.synchronise()
+                    clock.synchronize()
                     with timed("light_fits", apart=True):
                         clock.lag += 2.0
-        clock.synchronise()
+        clock.synchronize()
     seconds = ledger.seconds()["joint"]
     assert seconds["light_fits"] == pytest.approx(2.0)
     assert seconds["rendering"] == pytest.approx(3.0 * seconds["shading"])

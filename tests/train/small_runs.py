@@ -37,6 +37,11 @@ def small_config(**train) -> NeilfConfig:
     )
 
 
+def few_steps() -> NeilfConfig:
+    """These settings with six steps in all."""
+    return small_config(sdf_steps=2, material_steps=3, joint_steps=1)
+
+
 def solved_light(config: NeilfConfig) -> NeilfConfig:
     """The settings with the light of `fast`: a small map and lamps, fitted at every third step, and traced
     visibility.

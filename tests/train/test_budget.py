@@ -14,19 +14,21 @@ from rich.console import Console
 
 from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.cli import main
-from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest, parse_effects
 from neilfpp_method.effects.review import MAX_PIXELS, review_light
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train import budgeted, command
 from neilfpp_method.train.budget_record import BudgetPlan, read_budget
 from neilfpp_method.train.budgeted import planned_effects
 from neilfpp_method.train.command import run_training
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import load_checkpoint, load_run
-from neilfpp_method.train.trial import Trial, run_trial
+from neilfpp_method.train.trial import Trial, TrialLimits, Workload, run_trial
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light
 from tests.train.test_resume import interrupt_at
@@ -36,16 +38,11 @@ TICK = 0.1
 """Seconds that pass at every look at the clock: some two seconds a step."""
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> None:
     """A ledger whose clock advances at every reading, and a trial in which steps cost half as much."""
 
-    def ticking(synchronise: object = None) -> Ledger:
+    def ticking(synchronize: object = None) -> Ledger:
         ticks = itertools.count()
         return Ledger(now=lambda: TICK * next(ticks))
 
@@ -59,10 +56,13 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
 def run(data: Path | None, out: Path, resume: bool = False, **options) -> str:
     console = Console()
     config = None if resume else small_config(**STEPS)
-    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, **options}
     with console.capture() as said:
-        run_training(data=data, out=out, config=config, resume=resume, console=console, **options)
+        run_training(TrainingRequest(data, out, config, resume, device="cpu", **options), console)
     return said.get()
+
+
+def workload(capture: Capture, config: NeilfConfig, base: str, report: bool = False) -> Workload:
+    return Workload(capture, config, EffectRequest(base), torch.device("cpu"), report)
 
 
 def trained_steps(out: Path) -> int:
@@ -139,16 +139,8 @@ def test_a_run_without_a_budget_has_no_plan(tmp_path, capture, clock):
 
 def test_a_trial_measures_every_stage_that_has_steps(capture):
     config = solved_light(small_config(sdf_steps=100, material_steps=0, joint_steps=50))
-    state = load_capture(capture)
     trial = run_trial(
-        state,
-        config,
-        EffectRequest("auto"),
-        torch.device("cpu"),
-        0.2,
-        most_for_places=1e9,
-        most_for_light=1e9,
-        report=True,
+        workload(load_capture(capture), config, "auto", report=True), TrialLimits(0.2, 1e9, 1e9)
     )
     costs = trial.costs
     assert {stage: cost.steps for stage, cost in costs.stages.items()} == {"sdf_init": 100, "joint": 50}
@@ -162,16 +154,7 @@ def test_a_trial_measures_every_stage_that_has_steps(capture):
 
 def test_evidence_that_takes_too_long_is_not_measured(capture):
     config = solved_light(small_config(sdf_steps=0))
-    trial = run_trial(
-        load_capture(capture),
-        config,
-        EffectRequest("auto"),
-        torch.device("cpu"),
-        0.05,
-        1e-9,
-        1e-9,
-        report=False,
-    )
+    trial = run_trial(workload(load_capture(capture), config, "auto"), TrialLimits(0.05, 1e-9, 1e-9))
     assert trial.places == 0.0
     assert list(trial.costs.stages) == ["material_init", "joint"]
     assert trial.costs.stages["joint"].first_fit == 0.0  # it is in the previous stage
@@ -182,9 +165,7 @@ def test_the_initial_light_is_planned_with_as_many_pixels_as_the_time_permits(tm
     many = load_capture(make_capture(tmp_path / "many", views=9))
 
     def trial(most_for_light: float) -> Trial:
-        return run_trial(
-            many, config, EffectRequest("auto"), torch.device("cpu"), 0.05, 1e-9, most_for_light, report=False
-        )
+        return run_trial(workload(many, config, "auto"), TrialLimits(0.05, 1e-9, most_for_light))
 
     whole = trial(1e9)
     assert whole.light_pixels == MAX_PIXELS
@@ -214,16 +195,7 @@ def test_without_time_for_the_initial_light_training_starts_from_an_even_one(tmp
 
 def test_effects_that_settings_decide_are_not_measured_in_a_trial(capture):
     config = small_config(joint_steps=0)
-    trial = run_trial(
-        load_capture(capture),
-        config,
-        EffectRequest("as-set"),
-        torch.device("cpu"),
-        0.05,
-        1.0,
-        1.0,
-        report=False,
-    )
+    trial = run_trial(workload(load_capture(capture), config, "as-set"), TrialLimits(0.05, 1.0, 1.0))
     assert list(trial.costs.stages) == ["sdf_init", "material_init"]
     assert trial.costs.stages["material_init"].fit == 0.0  # a free light is not fitted
     assert trial.costs.reserve == trial.places == 0.0

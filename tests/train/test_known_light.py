@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import FreeLightConfig, LightFitConfig, MapLightConfig, NeilfConfig
 from neilfpp_method.train.light_record import LightFit, light_summary, read_fits, write_fits
 from neilfpp_method.train.run import load_run
-from tests.data.make_capture import make_capture
+from tests.calls import refused, train_tiny
 from tests.train.small_runs import small_config
 
 
@@ -32,22 +33,31 @@ def mapped_config() -> NeilfConfig:
     )
 
 
-@pytest.fixture(autouse=True)
-def _mapped_preset(monkeypatch):
-    monkeypatch.setitem(PRESETS, "mapped", mapped_config)
+@pytest.fixture(scope="module")
+def capture(masked_capture: Path) -> Path:
+    return masked_capture
+
+
+def export_map(run: Path) -> Path:
+    """Export the map of a run and return its file."""
+    assert main(["export", str(run), "--what", "light", "--device", "cpu"]) == 0
+    return run / "export" / "light" / "environment.exr"
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+def exported(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
+    """The exported map of a run."""
+    return export_map(train(capture, tmp_path_factory.mktemp("runs") / "first"))
 
 
-def command(*options: object) -> int:
-    return main([*map(str, options), "--device", "cpu"])
+@pytest.fixture
+def sky(exported: Path, tmp_path: Path) -> Path:
+    """A copy of that map which a test may remove."""
+    return Path(shutil.copy(exported, tmp_path / "sky.exr"))
 
 
-def train(capture: Path, out: Path, *options: object) -> int:
-    return command("train", "--preset", "mapped", "--data", capture, "--out", out, *options)
+def train(capture: Path, out: Path, *options: object) -> Path:
+    return train_tiny(capture, out, *options, config=mapped_config)
 
 
 def radiance_of(run: Path) -> torch.Tensor:
@@ -55,8 +65,7 @@ def radiance_of(run: Path) -> torch.Tensor:
 
 
 def test_an_exported_map_is_used_and_then_not_needed(capture, tmp_path, capfd):
-    first, second = tmp_path / "first", tmp_path / "second"
-    assert train(capture, first) == 0
+    first, second = train(capture, tmp_path / "first"), tmp_path / "second"
     said = capfd.readouterr().out
     record = read_fits(first, before=10**9)
     assert f"light: {light_summary(mapped_config().light, record)}" in said
@@ -64,43 +73,32 @@ def test_an_exported_map_is_used_and_then_not_needed(capture, tmp_path, capfd):
     assert len(record) >= 3
     assert read_fits(first, before=record[1].step) == record[:1]
 
-    assert command("export", first, "--what", "light") == 0
-    exported = first / "export" / "light" / "environment.exr"
-    assert read_image(exported).pixels.shape == (6, 12, 3)
-    sky = tmp_path / "sky.exr"
-    exported.rename(sky)
-    assert train(capture, second, "--light", sky, "--config.light.environment-height", 9) == 0
+    sky = export_map(first)
+    assert read_image(sky).pixels.shape == (6, 12, 3)
+    train(capture, second, "--light", sky, "--config.light.environment-height", 9)
     assert "light: the given environment map" in capfd.readouterr().out
     sky.unlink()
     torch.testing.assert_close(radiance_of(second), radiance_of(first), rtol=1e-5, atol=0.0)
     assert load_run(second).config.light.map == str(sky)
 
 
-def test_a_known_map_without_lamps_is_not_fitted(capture, tmp_path, capfd):
-    assert train(capture, tmp_path / "first") == 0
-    assert command("export", tmp_path / "first", "--what", "light") == 0
-    sky = tmp_path / "first" / "export" / "light" / "environment.exr"
-    out = tmp_path / "second"
-    assert train(capture, out, "--light", sky, "--config.light.kind", "distant") == 0
+def test_a_known_map_without_lamps_is_not_fitted(capture, sky, tmp_path):
+    out = train(capture, tmp_path / "run", "--light", sky, "--config.light.kind", "distant")
     run = load_run(out)
     assert isinstance(run.model.light_solver(), NothingToSolve)
     assert read_fits(out, before=10**9) == []
     assert not (out / "light.json").exists()
 
 
-def test_a_stopped_run_continues_without_the_file(capture, tmp_path):
+def test_a_stopped_run_continues_without_the_file(capture, sky, tmp_path):
     """With a checkpoint after every step; the first part of a run stands in for a stopped run."""
-    assert train(capture, tmp_path / "first") == 0
-    assert command("export", tmp_path / "first", "--what", "light") == 0
-    sky = tmp_path / "first" / "export" / "light" / "environment.exr"
-    out = tmp_path / "second"
-    assert train(capture, out, "--light", sky) == 0
+    out = train(capture, tmp_path / "run", "--light", sky)
     expected, record = radiance_of(out), read_fits(out, before=10**9)
     stage = (out / "checkpoints" / "material_init.pt").read_bytes()
     (out / "checkpoints" / "last.pt").write_bytes(stage)
     (out / "checkpoints" / "joint.pt").unlink()
     sky.unlink()
-    assert command("train", "--out", out, "--resume") == 0
+    assert main(["train", "--out", str(out), "--resume", "--device", "cpu"]) == 0
     torch.testing.assert_close(radiance_of(out), expected, rtol=0, atol=0)
     assert read_fits(out, before=10**9) == record  # no duplicates, and the same values
 
@@ -120,11 +118,9 @@ def test_an_invalid_map_is_refused_and_leaves_no_run(
     capture, tmp_path, capfd, monkeypatch, options, complaint
 ):
     monkeypatch.chdir(tmp_path)
-    assert train(capture, tmp_path / "run", *options) == 2
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1
-    assert complaint in said
-    assert list(tmp_path.iterdir()) == []
+    monkeypatch.setitem(PRESETS, "tiny", mapped_config)
+    command = ["train", "--data", capture, "--out", tmp_path / "run", "--preset", "tiny", *options]
+    refused(capfd, command, complaint, leaves=tmp_path)
 
 
 # ----------------------------------------------------------------------------------------------------- record

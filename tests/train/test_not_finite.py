@@ -7,7 +7,6 @@ from __future__ import annotations
 import copy
 import json
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,15 +19,9 @@ from neilfpp_method.structures import LossTerm
 from neilfpp_method.train import loop
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.training import Training
-from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, small_training
 
 # Four steps in each of three stages: 0–3, 4–7, 8–11.
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
 
 
 def spoil_loss(

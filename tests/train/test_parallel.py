@@ -19,7 +19,6 @@ from neilfpp_method.cli import main
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.optimizer import seed_step
-from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, small_training
 
 REPOSITORY = Path(__file__).parents[2]
@@ -31,11 +30,6 @@ STEPS = [
     "--config.train.joint-steps",
     "2",
 ]
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
 
 
 @contextmanager

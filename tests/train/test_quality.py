@@ -16,6 +16,7 @@ from neilfpp_method.train import quality
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.quality import FILE, MAX_SHARE, Quality, QualityCheck, read_checks
+from neilfpp_method.train.request import TrainingRequest
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch, sphere_model
 from tests.train.small_runs import differences, small_config, small_training, solved_light
@@ -28,9 +29,8 @@ def capture(tmp_path_factory):
 
 
 def train_here(data, out, resume=False, **settings):
-    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1}
     config = None if resume else solved_light(small_config(**settings))
-    run_training(data=data, out=out, config=config, resume=resume, console=Console(quiet=True), **options)
+    run_training(TrainingRequest(data, out, config, resume, device="cpu"), Console(quiet=True))
 
 
 def test_checks_do_not_change_the_training_and_continue_after_a_stop(tmp_path, capture, monkeypatch):

@@ -25,6 +25,7 @@ from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import loop
 from neilfpp_method.train.command import run_training
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import load_run, read_description
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config, solved_light
@@ -38,9 +39,8 @@ def run(
 ) -> str:
     """Train or continue, and return the printed messages."""
     console = Console()
-    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, **options}
     with console.capture() as said:
-        run_training(data=data, out=out, config=config, resume=resume, console=console, **options)
+        run_training(TrainingRequest(data, out, config, resume, device="cpu", **options), console)
     return said.get()
 
 
@@ -65,11 +65,6 @@ def files(folder: Path) -> dict[Path, tuple[int, bytes]]:
     return {
         path: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.rglob("*") if path.is_file()
     }
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
 
 
 @pytest.fixture(scope="module")

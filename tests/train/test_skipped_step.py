@@ -19,13 +19,7 @@ from neilfpp_method.train.rerun import rerun_step, rerun_summary
 from neilfpp_method.train.run import CaptureSource, create_run
 from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
 from neilfpp_method.train.training import Training
-from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere")
 
 
 @pytest.fixture

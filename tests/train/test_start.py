@@ -21,6 +21,7 @@ from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
 from neilfpp_method.train import command, start
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import save_checkpoint
 from neilfpp_method.train.start import GeometryStart, start_geometry
 from tests.data.make_capture import RADIUS, SCALE, make_capture
@@ -145,17 +146,9 @@ def test_training_prints_its_start_and_a_resumed_run_does_not_start_again(masked
     said = []
     for resume in (False, True):
         console = Console(file=io.StringIO(), width=200)
-        command.run_training(
-            data=None if resume else masked,
-            out=tmp_path / "run",
-            config=None if resume else settings(),
-            resume=resume,
-            test_every=None,
-            response="auto",
-            device="cpu",
-            devices=1,
-            console=console,
-        )
+        data, config = (None, None) if resume else (masked, settings())
+        request = TrainingRequest(data, tmp_path / "run", config, resume, device="cpu")
+        command.run_training(request, console)
         said.append(console.file.getvalue())
     assert "geometry starts as the visual hull of 11 masks" in said[0]
     assert "geometry starts" not in said[1]

@@ -10,7 +10,8 @@ from rich.console import Console
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.timing.ledger import WORK
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.run import write_json
+from neilfpp_method.train.json_files import write_json
+from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.work_record import FILE, read_work
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, solved_light
@@ -20,17 +21,16 @@ from tests.train.test_resume import interrupt_at
 def test_the_seconds_of_a_stopped_run_add_up_to_the_clock(tmp_path, monkeypatch):
     capture, out = make_capture(tmp_path / "sphere"), tmp_path / "run"
     config, console = solved_light(small_config()), Console(quiet=True)
-    options = {"test_every": None, "response": "auto", "device": "cpu", "devices": 1, "console": console}
     taken = 0.0
     with monkeypatch.context() as patch:
         interrupt_at(patch, 6)
         began = time.perf_counter()
         with pytest.raises(Stopped):
-            run_training(data=capture, out=out, config=config, resume=False, **options)
+            run_training(TrainingRequest(capture, out, config, device="cpu"), console)
         taken += time.perf_counter() - began
     before = read_work(out)
     began = time.perf_counter()
-    run_training(data=None, out=out, config=None, resume=True, **options)
+    run_training(TrainingRequest(out=out, resume=True, device="cpu"), console)
     taken += time.perf_counter() - began
 
     work = read_work(out)

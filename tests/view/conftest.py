@@ -2,39 +2,36 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import pytest
 
-from neilfpp_method.cli import main
-from neilfpp_method.settings.presets import PRESETS
-from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config, solved_light
+from tests.calls import train_tiny
+from tests.train.small_runs import few_steps, solved_light
 
 
 @pytest.fixture(scope="package")
-def capture(tmp_path_factory) -> Path:
-    return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+def capture(masked_capture) -> Path:
+    return masked_capture
 
 
 @pytest.fixture(scope="package")
 def found(tmp_path_factory, capture) -> Path:
     """A run with a recovered surface and an environment map."""
-    return _trained(tmp_path_factory.mktemp("runs") / "found", capture, solved_light)
+    out = tmp_path_factory.mktemp("runs") / "found"
+    return train_tiny(capture, out, config=lambda: solved_light(few_steps()))
 
 
 @pytest.fixture(scope="package")
 def given(tmp_path_factory, capture) -> Path:
     """A run with the capture's mesh and a light that is free at every point."""
-    return _trained(
-        tmp_path_factory.mktemp("runs") / "given", capture, lambda config: config, "--host", "mesh"
-    )
+    return train_tiny(capture, tmp_path_factory.mktemp("runs") / "given", "--host", "mesh", config=few_steps)
 
 
-def _trained(folder: Path, capture: Path, change, *options: str) -> Path:
-    steps = {"sdf_steps": 2, "material_steps": 3, "joint_steps": 1}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", lambda: change(small_config(**steps)))
-        words = ["train", "--data", str(capture), "--out", str(folder), "--device", "cpu", "--preset", "tiny"]
-        assert main([*words, *options]) == 0
-    return folder
+@pytest.fixture
+def port() -> int:
+    """A free port."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return free.getsockname()[1]

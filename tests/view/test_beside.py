@@ -19,13 +19,6 @@ PATIENCE = 120.0
 """Seconds for a process to import torch and to load a run, on a busy machine."""
 
 
-@pytest.fixture
-def port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
-
-
 def served(port: int) -> bool:
     with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5) as page:
         return page.status == 200

@@ -14,13 +14,6 @@ from neilfpp_method.view import command
 from neilfpp_method.view.address import check_free
 
 
-@pytest.fixture
-def port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
-
-
 def request(run: Path, port: int, **changes) -> command.Request:
     usual = {
         "env": (),

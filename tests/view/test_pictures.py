@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 
+from neilfpp_method.data import memory
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.relight.cameras import turntable
 from neilfpp_method.relight.film import Budget, render_picture
@@ -117,12 +118,19 @@ def test_a_free_light_shows_pbr_too(given, camera):
     assert frame.image.std() > 5
 
 
+def test_a_surface_too_large_for_the_memory_is_the_reason_in_the_note(found, monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 1000)
+    note = subject_of(load_run(found), 32).note
+    assert note.startswith("Only R can be shown: the distances of a grid of 32³ points need about")
+    assert note.endswith("; give a lower resolution, on the command line with --resolution.")
+
+
 def test_a_run_without_a_surface_shows_r_with_a_note(found, camera):
     run = load_run(found)
     run.model.host.sdf = lambda x: x.norm(dim=-1) + 1.0
     empty = subject_of(run, 32)
     assert empty.layers == ("radiance",)
-    assert "no surface" in empty.note
+    assert empty.note.startswith("Only R can be shown: no surface within")
     assert pictures(Request(empty, camera, "radiance", own_light(run)))[-1].share == 1
     assert point_under(empty, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)) is None
 

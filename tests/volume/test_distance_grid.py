@@ -8,12 +8,9 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.volume import distance_grid
 from neilfpp_method.volume.distance_grid import cell_size, look_up, sample_grid, trace_grid
+from tests.scenes import sphere_distance
 
 RADIUS = 1.5
-
-
-def sphere(x: torch.Tensor) -> torch.Tensor:
-    return x.norm(dim=-1) - 0.6
 
 
 def plate(x: torch.Tensor) -> torch.Tensor:
@@ -31,7 +28,7 @@ def test_look_up_is_exact_for_a_linear_field():
 
 def test_rays_hit_the_sphere_at_the_exact_points():
     torch.manual_seed(0)
-    grid = sample_grid(sphere, RADIUS, 96, torch.zeros(1))
+    grid = sample_grid(sphere_distance, RADIUS, 96, torch.zeros(1))
     origins = 1.4 * normalize(torch.randn(2000, 3), dim=-1)
     directions = normalize(torch.rand(2000, 3) - 0.5 - origins, dim=-1)
     found = trace_grid(grid, RADIUS, origins, directions)
@@ -56,14 +53,14 @@ def test_a_thin_plate_is_not_missed():
 
 
 def test_a_ray_that_leaves_the_cube_hits_nothing():
-    grid = sample_grid(sphere, RADIUS, 32, torch.zeros(1))
+    grid = sample_grid(sphere_distance, RADIUS, 32, torch.zeros(1))
     origins = torch.tensor([[0.0, 0.0, 0.9]]).expand(3, 3)
     found = trace_grid(grid, RADIUS, origins, torch.eye(3))
     assert not found.hit.any()
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("field", [sphere, plate])
+@pytest.mark.parametrize("field", [sphere_distance, plate])
 def test_compiled_loops_agree_with_the_reference(field, threads, monkeypatch):
     torch.manual_seed(0)
     grid = sample_grid(field, RADIUS, 33, torch.zeros(1, dtype=torch.float64))
@@ -84,7 +81,7 @@ def test_compiled_loops_agree_with_the_reference(field, threads, monkeypatch):
 
 
 def test_invalid_rays_hit_nothing():
-    grid = sample_grid(sphere, RADIUS, 17, torch.zeros(1))
+    grid = sample_grid(sphere_distance, RADIUS, 17, torch.zeros(1))
     broken = torch.tensor([[torch.nan, 0.0, 0.0], [torch.inf, 0.0, 0.0], [0.0, -torch.inf, torch.nan]])
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
     assert not trace_grid(grid, RADIUS, broken, up).hit.any()

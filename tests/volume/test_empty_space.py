@@ -21,13 +21,10 @@ from neilfpp_method.volume.distance_grid import cell_size
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import sphere_interval
 from neilfpp_method.volume.samplers import error_bounded_samples
+from tests.scenes import sphere_distance
 
 RADIUS = 1.75
 CELL = 2 * RADIUS / (empty_space.RESOLUTION - 1)
-
-
-def sphere(x):
-    return x.norm(dim=-1) - 0.6
 
 
 def hollow(x):
@@ -82,7 +79,7 @@ def assert_nothing_lost(sdf, rays, beta):
 
 @pytest.mark.parametrize("beta", [0.1, 0.01, 0.001])
 @pytest.mark.parametrize(
-    "sdf", [sphere, hollow, plate(0.2), plate(1e-3)], ids=["sphere", "hollow", "plate", "foil"]
+    "sdf", [sphere_distance, hollow, plate(0.2), plate(1e-3)], ids=["sphere", "hollow", "plate", "foil"]
 )
 @pytest.mark.parametrize("inside", [False, True])
 def test_skipped_parts_have_no_weight(sdf, beta, inside):
@@ -106,11 +103,11 @@ def test_grazing_rays_keep_the_surface_that_they_graze():
     height = torch.linspace(0.5, 0.75, 101)
     origins = torch.stack([torch.full_like(height, -2.5), height, torch.zeros_like(height)], -1)
     rays = RayBatch(origins, torch.tensor([1.0, 0.0, 0.0]).expand(101, 3))
-    assert_nothing_lost(sphere, rays, 0.01)
+    assert_nothing_lost(sphere_distance, rays, 0.01)
 
 
 def test_most_of_a_mostly_empty_ray_is_skipped():
-    whole, part = narrowed(sphere, bundle(), 0.01)
+    whole, part = narrowed(sphere_distance, bundle(), 0.01)
     assert (part.far - part.near).sum() < 0.4 * (whole.far - whole.near).sum()
 
 
@@ -120,7 +117,7 @@ def test_an_empty_ray_keeps_its_interval():
     assert torch.equal(part.far, whole.far)
 
 
-@pytest.mark.parametrize("sdf", [sphere, plate(0.3 * CELL)], ids=["sphere", "foil"])
+@pytest.mark.parametrize("sdf", [sphere_distance, plate(0.3 * CELL)], ids=["sphere", "foil"])
 def test_fewer_queries_find_the_same_surface(sdf):
     """The rendered median depth, compared with that of the true weights, from the part and from the whole
     ray.
@@ -134,9 +131,7 @@ def test_fewer_queries_find_the_same_surface(sdf):
 
     def run(interval):
         config = VolumeConfig(radius=RADIUS, samples=64)
-        found = error_bounded_samples(
-            sdf, rays.origins, rays.directions, interval.near, interval.far, torch.tensor(beta), config, False
-        )
+        found = error_bounded_samples(sdf, rays, interval, torch.tensor(beta), config, False)
         t = found.distances
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
         depth = laplace_depth(sdf(points.reshape(-1, 3)).view_as(t), t, torch.tensor(beta))
@@ -163,7 +158,7 @@ def may_hit(sdf, rays, beta=0.01):
 
 
 def leaving(steepest=0.2, height=0.06):
-    """Rays away from the sphere, with a minimum angle to it, from a given height above it."""
+    """Rays away from the sphere_distance, with a minimum angle to it, from a given height above it."""
     generator = torch.Generator().manual_seed(0)
     normal = normalize(torch.randn(300, 3, generator=generator), dim=-1)
     away = normalize(torch.randn(300, 3, generator=generator), dim=-1)
@@ -173,7 +168,7 @@ def leaving(steepest=0.2, height=0.06):
 
 
 def test_rays_that_leave_a_sphere_hit_nothing():
-    assert may_hit(sphere, leaving()).float().mean() < 0.03
+    assert may_hit(sphere_distance, leaving()).float().mean() < 0.03
 
 
 @settings(max_examples=25, deadline=None)
@@ -212,10 +207,10 @@ def test_no_thin_plate_in_front_of_a_ray_is_missed(share, seed, tilt, log_beta):
 
 def test_a_new_surface_is_detected_immediately():
     grid, rays = EmptySpace(RADIUS), bundle()
-    narrowed(sphere, rays, 0.01, grid)
+    narrowed(sphere_distance, rays, 0.01, grid)
 
     def moved(x):
-        return torch.minimum(sphere(x), (x - torch.tensor([0.0, 0.0, 1.2])).norm(dim=-1) - 0.5)
+        return torch.minimum(sphere_distance(x), (x - torch.tensor([0.0, 0.0, 1.2])).norm(dim=-1) - 0.5)
 
     whole, part = narrowed(moved, rays, 0.01, grid)
     assert torch.equal(part.near, whole.near)  # no ray skips anything
@@ -232,7 +227,7 @@ def test_the_grid_is_sampled_after_its_maximum_age():
 
     def counted(x):
         asked.append(len(x))
-        return sphere(x)
+        return sphere_distance(x)
 
     narrowed(counted, rays, 0.01, grid)
     assert sum(asked) == empty_space.RESOLUTION**3 + 5
@@ -247,12 +242,12 @@ def test_the_grid_is_sampled_after_its_maximum_age():
 
 def test_a_grid_from_a_checkpoint_skips_the_same_parts():
     one, other, rays = EmptySpace(RADIUS), EmptySpace(RADIUS), bundle()
-    narrowed(sphere, rays, 0.01, one)
+    narrowed(sphere_distance, rays, 0.01, one)
     one.moved()
     other.load_state_dict(one.state_dict())
     assert other.age == 1
-    _, first = narrowed(sphere, rays, 0.01, one)
-    _, second = narrowed(sphere, rays, 0.01, other)
+    _, first = narrowed(sphere_distance, rays, 0.01, one)
+    _, second = narrowed(sphere_distance, rays, 0.01, other)
     assert torch.equal(first.near, second.near)
     assert torch.equal(first.far, second.far)
 

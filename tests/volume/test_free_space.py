@@ -10,9 +10,12 @@ import pytest
 import torch
 
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from tests.scenes import tiny_config
+
+FACTS = SceneFacts("linear", 0.2, 3.0, "constant")
 
 
 def ring(count: int, distance: float) -> torch.Tensor:
@@ -57,8 +60,8 @@ def test_distant_cameras_do_not_change_the_scene():
     near, far = ring(6, 1.8), ring(6, 2.4)  # 2.4 − 0.6 = 1.8 lies beyond the scene sphere
     assert torch.equal(free_balls(torch.cat([near, far]), None, 1.75).center, near)
     config = tiny_config()
-    assert VolSdfHost(config, 3.0, "constant", cameras=far).free_space is None
-    assert VolSdfHost(config, 3.0, "constant", cameras=0.5 * near).free_space is None
+    assert VolSdfHost(config, FACTS, cameras=far).free_space is None
+    assert VolSdfHost(config, FACTS, cameras=0.5 * near).free_space is None
 
 
 def test_the_depth_is_that_of_the_deepest_ball():
@@ -82,7 +85,7 @@ def test_fog_in_front_of_a_camera_is_cut_out_and_the_object_is_not():
     config = tiny_config()
     cameras = ring(12, 1.5)
     torch.manual_seed(0)
-    cut, whole = (VolSdfHost(config, 3.0, "constant", cameras=places).eval() for places in (cameras, None))
+    cut, whole = (VolSdfHost(config, FACTS, cameras=places).eval() for places in (cameras, None))
     cut.load_state_dict(whole.state_dict())
     with torch.no_grad():
         # First the object: both show the initial ball of the field.

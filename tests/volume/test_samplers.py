@@ -11,9 +11,11 @@ import torch
 from scipy.stats import chisquare, kstest, laplace
 
 from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
+from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
     SPREAD,
@@ -22,14 +24,11 @@ from neilfpp_method.volume.samplers import (
     inverse_cdf_samples,
     uniform_samples,
 )
+from tests.scenes import sphere_distance
 
 F64 = torch.float64
 CONFIG = VolumeConfig()
 TILT = torch.tensor([0.36, 0.48, 0.8], dtype=F64)  # a unit vector
-
-
-def sphere(x):
-    return x.norm(dim=-1) - 0.6
 
 
 def thin_plate(x):
@@ -40,7 +39,7 @@ def tilted_plane(x):
     return x @ TILT.to(x) - 0.2
 
 
-SURFACES = [sphere, thin_plate, tilted_plane]
+SURFACES = [sphere_distance, thin_plate, tilted_plane]
 
 
 def ray_bundle(count, dtype=F64):
@@ -60,13 +59,16 @@ def ray_bundle(count, dtype=F64):
 
 
 def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
-    return error_bounded_samples(sdf, *rays, torch.tensor(beta, dtype=rays[0].dtype), config, stochastic)
+    origins, directions, near, far = rays
+    beta = torch.tensor(beta, dtype=near.dtype)
+    interval = Interval(near, far)
+    return error_bounded_samples(sdf, RayBatch(origins, directions), interval, beta, config, stochastic)
 
 
 # -------------------------------------------------------------------------------------------- simple samplers
 
 
-def test_uniform_samples_are_both_ends_and_the_centres_of_equal_parts():
+def test_uniform_samples_are_both_ends_and_the_centers_of_equal_parts():
     samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 6, False)
     assert samples.tolist() == [[0.0, 0.5, 1.5, 2.5, 3.5, 4.0], [1.0] * 6]
 
@@ -205,7 +207,7 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
 
 
 def test_the_bound_shows_when_the_rounds_were_too_few():
-    found = sample(sphere, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
+    found = sample(sphere_distance, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
     assert (found.error_bound > OPACITY_ERROR).any()
     assert found.distances.isfinite().all()
 
@@ -223,9 +225,11 @@ def test_samples_are_dense_at_the_surface(stochastic):
     exact = (closest - (0.36 - gap.square()).clamp_min(0.0).sqrt())[hits]
 
     beta = 0.002
-    distances = sample(sphere, rays, beta, stochastic=stochastic).distances
+    distances = sample(sphere_distance, rays, beta, stochastic=stochastic).distances
     points = origins[:, None] + distances[..., None] * directions[:, None]
-    density = laplace_density(sphere(points.reshape(-1, 3)).reshape(distances.shape), torch.tensor(beta))
+    density = laplace_density(
+        sphere_distance(points.reshape(-1, 3)).reshape(distances.shape), torch.tensor(beta)
+    )
     weights = render_weights(density, distances, far).weights
     depth = ((weights * distances).sum(-1) / weights.sum(-1))[hits]
     assert hits.sum() > 100
@@ -274,7 +278,7 @@ def test_queries_are_counted_and_not_repeated():
 
     def recorded(x):
         asked.append(x)
-        return sphere(x)
+        return sphere_distance(x)
 
     found = sample(recorded, ray_bundle(50), 0.01)
     points = torch.cat(asked)
@@ -285,16 +289,16 @@ def test_queries_are_counted_and_not_repeated():
 
 def test_a_ray_does_not_depend_on_other_rays():
     bundle = ray_bundle(20)
-    together = sample(sphere, bundle, 0.005)
+    together = sample(sphere_distance, bundle, 0.005)
     for i in range(20):
-        alone = sample(sphere, [part[i : i + 1] for part in bundle], 0.005)
+        alone = sample(sphere_distance, [part[i : i + 1] for part in bundle], 0.005)
         torch.testing.assert_close(together.distances[i : i + 1], alone.distances)
         torch.testing.assert_close(together.error_bound[i : i + 1], alone.error_bound)
 
 
 def test_without_removing_rays_the_bound_is_met_as_well(monkeypatch):
     monkeypatch.setattr(samplers, "can_leave_early", lambda device: False)
-    found = sample(sphere, ray_bundle(50), 0.01)
+    found = sample(sphere_distance, ray_bundle(50), 0.01)
     assert found.sdf_queries == 128 * (1 + 5)
     assert (found.error_bound <= OPACITY_ERROR).all()
     assert (found.distances.diff(dim=-1) >= 0.0).all()
@@ -307,9 +311,9 @@ def test_cuts_by_contribution_are_better_than_cuts_by_the_bound(monkeypatch):
         error, depth = samplers.depth_error(partition, beta), samplers.optical_depth(partition, beta)
         return torch.expm1(error.clamp_max(80.0)) * torch.exp(-depth)
 
-    ours = sample(sphere, ray_bundle(200), 0.01)
+    ours = sample(sphere_distance, ray_bundle(200), 0.01)
     monkeypatch.setattr(samplers, "bound_shares", bound_itself)
-    papers = sample(sphere, ray_bundle(200), 0.01)
+    papers = sample(sphere_distance, ray_bundle(200), 0.01)
     assert (ours.error_bound <= OPACITY_ERROR).float().mean() >= (
         papers.error_bound <= OPACITY_ERROR
     ).float().mean()
@@ -318,17 +322,21 @@ def test_cuts_by_contribution_are_better_than_cuts_by_the_bound(monkeypatch):
 
 def test_central_samples_are_deterministic_and_random_ones_depend_on_the_seed():
     rays = ray_bundle(4)
-    assert torch.equal(sample(sphere, rays, 0.02).distances, sample(sphere, rays, 0.02).distances)
+    assert torch.equal(
+        sample(sphere_distance, rays, 0.02).distances, sample(sphere_distance, rays, 0.02).distances
+    )
     draws = []
     for seed in (1, 1, 2):
         torch.manual_seed(seed)
-        draws.append(sample(sphere, rays, 0.02, stochastic=True).distances)
+        draws.append(sample(sphere_distance, rays, 0.02, stochastic=True).distances)
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
 
 
 def test_samples_have_no_gradient():
     beta = torch.tensor(0.02, dtype=F64, requires_grad=True)
-    found = error_bounded_samples(sphere, *ray_bundle(2), beta, CONFIG, True)
+    origins, directions, near, far = ray_bundle(2)
+    rays, interval = RayBatch(origins, directions), Interval(near, far)
+    found = error_bounded_samples(sphere_distance, rays, interval, beta, CONFIG, True)
     assert not found.distances.requires_grad
     assert not found.error_bound.requires_grad

@@ -18,13 +18,13 @@ from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import CaptureFiles, View, inside
 
-__all__ = ["LAYOUT", "read", "recognise"]
+__all__ = ["LAYOUT", "read", "recognize"]
 
 LAYOUT = "transforms_train.json"
 TEST = "transforms_test.json"
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Whether the folder has a transforms_train.json."""
     return (root / LAYOUT).is_file()
 

@@ -27,7 +27,7 @@ from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["LAYOUT", "camera_of", "model_folder", "open_model", "read", "recognise"]
+__all__ = ["LAYOUT", "camera_of", "model_folder", "open_model", "read", "recognize"]
 
 LAYOUT = "a COLMAP model in sparse/0, sparse or the folder itself"
 NUMBERED = ("sparse", "colmap/sparse")
@@ -40,7 +40,7 @@ POINT_CLOUDS = ("fused.ply", "dense/fused.ply", "dense/0/fused.ply")
 FILES = ("cameras", "images", "points3D")
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Whether the folder has a complete model in one of the places in which COLMAP's tools write it."""
     return model_folder(root) is not None
 

@@ -23,7 +23,7 @@ from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognise"]
+__all__ = ["LAYOUT", "read", "recognize"]
 
 LAYOUT = "cameras_sphere.npz or cameras.npz, and image/ or rgb/"
 CAMERAS = ("cameras_sphere.npz", "cameras.npz")
@@ -35,7 +35,7 @@ MAX_SKEW = 0.05
 """Largest horizontal shift by skew across the height of an image, in pixels, that counts as rounding."""
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Whether the folder has a camera archive and a folder of images."""
     return any((root / name).is_file() for name in CAMERAS) and any((root / name).is_dir() for name in IMAGES)
 

@@ -20,7 +20,7 @@ from neilfpp_method.data.images import image_header
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognise"]
+__all__ = ["LAYOUT", "read", "recognize"]
 
 LAYOUT = "0-camera.pkl, 0.png and so on"
 SUFFIX = "-camera.pkl"
@@ -28,7 +28,7 @@ MAX_SKEW = 1e-3
 """Largest ratio of skew to focal length that counts as rounding."""
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Whether the folder has the first camera."""
     return (root / f"0{SUFFIX}").is_file()
 

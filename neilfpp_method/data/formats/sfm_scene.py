@@ -27,7 +27,7 @@ from neilfpp_method.data.point_cloud import read_oriented_ply
 from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["LAYOUT", "read", "recognise"]
+__all__ = ["LAYOUT", "read", "recognize"]
 
 LAYOUT = "inputs/sfm_scene.json"
 PLACES = ("inputs/sfm_scene.json", "sfm_scene.json", "inputs/model/sfm_scene.json")
@@ -36,7 +36,7 @@ VALID = 2
 """Value of `flg` of a camera with a valid pose."""
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Whether the folder has a scene file where this layout puts it."""
     return any((root / place).is_file() for place in PLACES)
 
@@ -126,15 +126,15 @@ def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
     if "bbox" in scene.entries():
         entry = scene["bbox"]["transform"]
         box = entry.numbers((16,), (4, 4)).reshape(4, 4)
-        extents, centre, where = np.diagonal(box)[:3], box[:3, 3], entry.where
+        extents, center, where = np.diagonal(box)[:3], box[:3, 3], entry.where
     elif point_cloud is not None:
         points = read_oriented_ply(point_cloud).position
         low, high = points.min(axis=0), points.max(axis=0)
-        extents, centre, where = high - low, (low + high) / 2, str(point_cloud)
+        extents, center, where = high - low, (low + high) / 2, str(point_cloud)
     else:
         raise UserError(
             f"{scene.where}: no bbox and no {POINT_CLOUD}", "add one: it says where the object is"
         )
     if extents.min() < 0 or extents.max() == 0:
         raise UserError(f"{where}: the box is empty or inside out", "give the full extents on the diagonal")
-    return Normalisation(float(extents.max() / 2), tuple(map(float, centre)))
+    return Normalisation(float(extents.max() / 2), tuple(map(float, center)))

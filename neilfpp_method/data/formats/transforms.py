@@ -37,7 +37,7 @@ from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognise"]
+__all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognize"]
 
 LAYOUT = "transforms.json"
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
@@ -46,7 +46,7 @@ MODELS = ("OPENCV", FISHEYE, "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADI
 """Accepted values of `camera_model`."""
 
 
-def recognise(root: Path) -> bool:
+def recognize(root: Path) -> bool:
     """Whether the folder has a transforms.json."""
     return (root / LAYOUT).is_file()
 

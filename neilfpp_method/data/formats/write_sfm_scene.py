@@ -37,7 +37,7 @@ def write_sfm_scene(capture: Capture, out: Path) -> Path:
             }
             files[str(i)] = view.image.relative_to(inputs).as_posix()
         box = np.diag([2 * capture.normalisation.scale] * 3 + [1.0])
-        box[:3, 3] = capture.normalisation.centre
+        box[:3, 3] = capture.normalisation.center
         scene = {
             "camera_track_map": {"images": tracks},
             "image_path": {"file_paths": files},

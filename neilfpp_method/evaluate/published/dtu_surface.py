@@ -54,8 +54,8 @@ def thinned(points: Float[np.ndarray, "P 3"], spacing: float, seed: int) -> Floa
     tree = cKDTree(shuffled)
     kept: Bool[np.ndarray, " P"] = np.ones(len(points), bool)
     for begin in range(0, len(points), AT_ONCE):
-        neighbours = tree.query_ball_point(shuffled[begin : begin + AT_ONCE], spacing)
-        for i, near in enumerate(neighbours, begin):
+        neighbors = tree.query_ball_point(shuffled[begin : begin + AT_ONCE], spacing)
+        for i, near in enumerate(neighbors, begin):
             if kept[i]:
                 kept[near] = False
                 kept[i] = True

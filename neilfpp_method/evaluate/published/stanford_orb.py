@@ -54,7 +54,7 @@ SIDE = 512
 """Width and height at which views are measured, pixels (official code)."""
 LARGEST_HDR = 4.0
 """Value at which PSNR-H clips (official code)."""
-GREY = 0.5
+GRAY = 0.5
 """Value of the constant image whose PSNR is the lower bound (official code)."""
 EPSILON = 1e-6
 """Smallest length of a normal, and smallest energy of a depth map (official code)."""
@@ -108,8 +108,8 @@ def normal_distance(estimate: Image, truth: Image, mask: Mask) -> float:
 
 def _floored(estimate: Image, truth: Image, inner: Float[np.ndarray, "H W 1"]) -> float:
     """PSNR over the frame, at least that of a grey image in the mask."""
-    error, grey = (np.square(e - truth, dtype=np.float64).mean() for e in (estimate, GREY * inner))
-    return decibels(float(min(error, grey)))
+    error, gray = (np.square(e - truth, dtype=np.float64).mean() for e in (estimate, GRAY * inner))
+    return decibels(float(min(error, gray)))
 
 
 def _ssim(estimate: Image, truth: Image) -> float:

@@ -17,7 +17,8 @@ from neilfpp_method.export.asset.glb import glb_bytes
 from neilfpp_method.export.asset.scene_file import describe_scene
 from neilfpp_method.export.asset.usd import has_usd, usd_text
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.train.run import Run, write_json
+from neilfpp_method.train.json_files import write_json
+from neilfpp_method.train.run import Run
 
 __all__ = ["write_asset"]
 

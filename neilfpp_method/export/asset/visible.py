@@ -38,7 +38,7 @@ def visible_faces(surface: Surface, cameras: Sequence[Camera]) -> Bool[np.ndarra
     """
     tracer, mesh = first_hits(surface), surface.mesh()
     outward = torch.from_numpy(np.array(mesh.face_normals)).float()
-    centre = torch.from_numpy(np.array(mesh.triangles_center)).float()
+    center = torch.from_numpy(np.array(mesh.triangles_center)).float()
     visible = torch.zeros(len(surface.faces), dtype=torch.bool)
     stride = math.ceil(sum(camera.width * camera.height for camera in cameras) / MAX_RAYS)
     for camera in cameras:
@@ -51,14 +51,14 @@ def visible_faces(surface: Surface, cameras: Sequence[Camera]) -> Bool[np.ndarra
             visible[face[(outward[face] * directions).sum(-1) < 0]] = True
     for camera in cameras:
         eye = torch.from_numpy(camera.c2w[:, 3]).float()
-        rows = torch.nonzero(~visible & (((eye - centre) * outward).sum(-1) > 0))[:, 0]
-        projected = project(camera, centre[rows])
+        rows = torch.nonzero(~visible & (((eye - center) * outward).sum(-1) > 0))[:, 0]
+        projected = project(camera, center[rows])
         size = projected.pixel.new_tensor([camera.width, camera.height])
         in_image = (projected.depth > 0) & ((projected.pixel >= 0) & (projected.pixel < size)).all(-1)
         for part in rows[in_image].split(RAYS_AT_ONCE):
-            direction = centre[part] - eye
+            direction = center[part] - eye
             face = tracer(eye.expand_as(direction), torch.nn.functional.normalize(direction, dim=-1))
             # Near an edge the ray may hit the neighbouring triangle instead.
-            neighbour = (centre[face.clamp_min(0)] - centre[part]).norm(dim=-1) < NEAR
-            visible[part[(face == part) | ((face >= 0) & neighbour)]] = True
+            neighbor = (center[face.clamp_min(0)] - center[part]).norm(dim=-1) < NEAR
+            visible[part[(face == part) | ((face >= 0) & neighbor)]] = True
     return visible.numpy()

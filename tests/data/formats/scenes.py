@@ -10,13 +10,13 @@ import pytest
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
-from tests.data.make_capture import CENTRE, RADIUS, camera_pose, make_capture
+from tests.data.make_capture import CENTER, RADIUS, camera_pose, make_capture
 
 VIEWS = 6
 WIDTH, HEIGHT = 24, 18
 FOCAL, PRINCIPAL = (1.4 * HEIGHT, 1.5 * HEIGHT), (WIDTH / 2 + 0.5, HEIGHT / 2 - 0.25)
 POSES = [camera_pose(i, VIEWS) for i in range(VIEWS)]
-POINTS = CENTRE + np.random.default_rng(5).uniform(-RADIUS, RADIUS, (40, 3))
+POINTS = CENTER + np.random.default_rng(5).uniform(-RADIUS, RADIUS, (40, 3))
 
 
 def material(root: Path, folder: str = "images", masks: str | None = "masks", hdr: bool = True) -> Path:

@@ -13,7 +13,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_png
 from neilfpp_method.data.views import project
 from tests.data.formats.scenes import POINTS, VIEWS, WIDTH, local, material, opengl_pose, refused
-from tests.data.make_capture import CENTRE, RADIUS
+from tests.data.make_capture import CENTER, RADIUS
 
 FOCAL = 25.0
 ANGLE = 2 * np.arctan(WIDTH / 2 / FOCAL)
@@ -62,7 +62,7 @@ def test_cameras_masks_and_splits(tmp_path: Path, hdr: bool) -> None:
     masks = [view.mask and view.mask.parent.name for view in capture.views]
     assert masks == (["train_mask"] * 4 + ["test_mask"] * 2 if hdr else [None] * 6)
     assert capture.scene_from == "masks"
-    assert np.allclose(capture.normalisation.centre, CENTRE, atol=0.3 * RADIUS)
+    assert np.allclose(capture.normalisation.center, CENTER, atol=0.3 * RADIUS)
 
 
 def test_without_a_test_file_every_eighth_view_is_held_out(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ from tests.data.formats.scenes import (
     pinhole_pixels,
     refused,
 )
-from tests.data.make_capture import CENTRE, RADIUS
+from tests.data.make_capture import CENTER, RADIUS
 from tests.data.test_lens import COEFFICIENTS
 
 MODELS = (*sorted(PINHOLES), *LENSES)
@@ -51,8 +51,8 @@ def reconstruction(camera: pycolmap.Camera, names: list[str] | None = None) -> p
         image = pycolmap.Image(name=name, camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
     points = np.random.default_rng(2).normal(size=(600, 3))
-    points = CENTRE + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
-    for point in (*points, 300 * CENTRE, -200 * CENTRE):
+    points = CENTER + RADIUS * points / np.linalg.norm(points, axis=1, keepdims=True)
+    for point in (*points, 300 * CENTER, -200 * CENTER):
         model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
     return model
 
@@ -114,7 +114,7 @@ def test_the_scene_box_comes_from_the_sparse_points(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
     capture = load_capture(tmp_path)
     assert capture.scene_from == "points"
-    assert np.allclose(capture.normalisation.centre, CENTRE, atol=0.05 * RADIUS)
+    assert np.allclose(capture.normalisation.center, CENTER, atol=0.05 * RADIUS)
     assert RADIUS < capture.normalisation.scale < 1.15 * RADIUS
     assert capture.point_cloud is None  # sparse points have no normals
 
@@ -127,7 +127,7 @@ def test_the_scene_box_comes_from_the_points_of_the_object(tmp_path: Path) -> No
     assert load_capture(tmp_path).normalisation.scale < 3  # the focus of the cameras, not the room
     (tmp_path / "cloud.ply").rename(tmp_path / "object_point_cloud.ply")
     capture = load_capture(tmp_path)
-    assert np.allclose(capture.normalisation.centre, CENTRE, atol=0.05 * RADIUS)
+    assert np.allclose(capture.normalisation.center, CENTER, atol=0.05 * RADIUS)
     assert RADIUS < capture.normalisation.scale < 1.15 * RADIUS
 
 

@@ -25,7 +25,7 @@ from tests.data.formats.scenes import (
     pinhole_pixels,
     refused,
 )
-from tests.data.make_capture import CENTRE, SCALE
+from tests.data.make_capture import CENTER, SCALE
 
 # Pixel centres have integer coordinates in these files.
 K = np.array([[FOCAL[0], 0, PRINCIPAL[0] - 0.5], [0, FOCAL[1], PRINCIPAL[1] - 0.5], [0, 0, 1]])
@@ -37,7 +37,7 @@ def matrices(factor: float = 1.0) -> dict[str, np.ndarray]:
         arrays[f"world_mat_{i}"] = np.eye(4)
         arrays[f"world_mat_{i}"][:3] = factor * K @ pose[:3]
         arrays[f"scale_mat_{i}"] = np.diag([SCALE, SCALE, SCALE, 1.0])
-        arrays[f"scale_mat_{i}"][:3, 3] = CENTRE
+        arrays[f"scale_mat_{i}"][:3, 3] = CENTER
         arrays[f"world_mat_inv_{i}"] = np.linalg.inv(arrays[f"world_mat_{i}"])
     return arrays
 
@@ -71,7 +71,7 @@ def test_projection_matrices(tmp_path: Path, factor: float, folder: str, archive
 def test_the_scale_matrix_is_the_scene_frame(tmp_path: Path) -> None:
     normalisation = load_capture(scan(tmp_path)).normalisation
     assert normalisation.scale == SCALE
-    assert normalisation.centre == tuple(CENTRE)
+    assert normalisation.center == tuple(CENTER)
 
 
 def test_masks_are_assigned_by_order_if_names_differ(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from tests.data.formats.scenes import (
     material,
     pinhole_pixels,
 )
-from tests.data.make_capture import CENTRE, SCALE
+from tests.data.make_capture import CENTER, SCALE
 from tests.data.test_lens import COEFFICIENTS
 
 TOLERANCE = 0.01
@@ -54,7 +54,7 @@ WORLDS = {
 }
 
 
-def neilfpp(root: Path, w2c: list[np.ndarray], centre: np.ndarray, lens: dict | None = None) -> None:
+def neilfpp(root: Path, w2c: list[np.ndarray], center: np.ndarray, lens: dict | None = None) -> None:
     camera = {
         "fx": FOCAL[0],
         "fy": FOCAL[1],
@@ -68,7 +68,7 @@ def neilfpp(root: Path, w2c: list[np.ndarray], centre: np.ndarray, lens: dict | 
         {"name": str(i), "image": f"images/{name}", "camera": camera | {"w2c": pose.tolist()}}
         for i, (name, pose) in enumerate(zip(NAMES, w2c, strict=True))
     ]
-    scene = {"centre": centre.tolist(), "radius": SCALE}
+    scene = {"centre": center.tolist(), "radius": SCALE}
     content = {
         "format": "neilfpp-capture",
         "version": 1,
@@ -79,7 +79,7 @@ def neilfpp(root: Path, w2c: list[np.ndarray], centre: np.ndarray, lens: dict | 
     (root / "capture.json").write_text(json.dumps(content))
 
 
-def sfm_scene(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
+def sfm_scene(root: Path, w2c: list[np.ndarray], center: np.ndarray) -> None:
     (root / "inputs").mkdir()
     (root / "images").rename(root / "inputs" / "images")
     camera = {"intrinsic": {"focal": list(FOCAL), "ppt": list(PRINCIPAL)}}
@@ -88,7 +88,7 @@ def sfm_scene(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
         for i, pose in enumerate(w2c)
     }
     box = np.diag([2 * SCALE] * 3 + [1.0])
-    box[:3, 3] = centre
+    box[:3, 3] = center
     scene = {
         "camera_track_map": {"images": tracks},
         "image_path": {"file_paths": {str(i): f"images/{name}" for i, name in enumerate(NAMES)}},
@@ -97,18 +97,18 @@ def sfm_scene(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
     (root / "inputs" / "sfm_scene.json").write_text(json.dumps(scene))
 
 
-def dtu(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
+def dtu(root: Path, w2c: list[np.ndarray], center: np.ndarray) -> None:
     (root / "images").rename(root / "image")
     to_whole_numbers = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])  # pixel centres
     sphere = np.diag([SCALE] * 3 + [1.0])
-    sphere[:3, 3] = centre
+    sphere[:3, 3] = center
     arrays = {f"scale_mat_{i}": sphere for i in range(VIEWS)}
     for i, pose in enumerate(w2c):
         arrays[f"world_mat_{i}"] = np.concatenate([to_whole_numbers @ K @ pose[:3], [[0, 0, 0, 1]]])
     np.savez(root / "cameras_sphere.npz", **arrays)
 
 
-def transforms(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
+def transforms(root: Path, w2c: list[np.ndarray], center: np.ndarray) -> None:
     frames = [
         {"file_path": f"images/{name}", "transform_matrix": (np.linalg.inv(pose) @ OPENGL).tolist()}
         for name, pose in zip(NAMES, w2c, strict=True)
@@ -124,12 +124,12 @@ def transforms(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
     (root / "transforms.json").write_text(json.dumps(shared | {"camera_model": "OPENCV", "frames": frames}))
 
 
-def blender(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
-    transforms(root, w2c, centre)
+def blender(root: Path, w2c: list[np.ndarray], center: np.ndarray) -> None:
+    transforms(root, w2c, center)
     (root / "transforms.json").rename(root / "transforms_train.json")
 
 
-def colmap(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
+def colmap(root: Path, w2c: list[np.ndarray], center: np.ndarray) -> None:
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         model="PINHOLE", width=WIDTH, height=HEIGHT, params=[*FOCAL, *PRINCIPAL], camera_id=1
@@ -142,7 +142,7 @@ def colmap(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
     model.write(root / "sparse")
 
 
-def nero(root: Path, w2c: list[np.ndarray], centre: np.ndarray) -> None:
+def nero(root: Path, w2c: list[np.ndarray], center: np.ndarray) -> None:
     for i, pose in enumerate(w2c):
         (root / "images" / NAMES[i]).rename(root / f"{i}.exr")
         (root / f"{i}-camera.pkl").write_bytes(pickle.dumps((pose[:3], K)))
@@ -169,7 +169,7 @@ def test_points_project_to_known_pixels(tmp_path: Path, layout: str, world: str)
     move = WORLDS[world]
     material(tmp_path, masks=None)
     WRITERS[layout](
-        tmp_path, [pose @ np.linalg.inv(move) for pose in POSES], move[:3, :3] @ CENTRE + move[:3, 3]
+        tmp_path, [pose @ np.linalg.inv(move) for pose in POSES], move[:3, :3] @ CENTER + move[:3, 3]
     )
     capture = load_capture(tmp_path)
     assert capture.format == layout
@@ -184,7 +184,7 @@ def test_points_project_to_known_pixels(tmp_path: Path, layout: str, world: str)
 @pytest.mark.parametrize("model", LENSES)
 def test_every_lens_in_the_own_layout(tmp_path: Path, model: str) -> None:
     neilfpp(
-        material(tmp_path, masks=None), POSES, CENTRE, {"model": model, "coefficients": COEFFICIENTS[model]}
+        material(tmp_path, masks=None), POSES, CENTER, {"model": model, "coefficients": COEFFICIENTS[model]}
     )
     plane = pycolmap.Camera.create_from_model_name(0, model, 1.0, 1, 1)
     parameters = np.array(plane.params)

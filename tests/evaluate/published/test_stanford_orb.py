@@ -77,8 +77,8 @@ def shrunk(mask: np.ndarray) -> np.ndarray:
 
 def psnr(estimate: np.ndarray, truth: np.ndarray, inner: np.ndarray) -> float:
     error = ((estimate - truth) ** 2).sum() / truth.size
-    grey = ((0.5 * inner[..., None] - truth) ** 2).sum() / truth.size
-    return max(-10 / math.log(10) * math.log(error), -10 / math.log(10) * math.log(grey))
+    gray = ((0.5 * inner[..., None] - truth) ** 2).sum() / truth.size
+    return max(-10 / math.log(10) * math.log(error), -10 / math.log(10) * math.log(gray))
 
 
 def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -131,11 +131,11 @@ def test_agrees_with_the_official_formula(tmp_path, files):
     assert figures == pytest.approx(expected, abs=5e-4)
 
 
-def test_no_image_scores_below_grey():
+def test_no_image_scores_below_gray():
     full = np.ones((SIDE, SIDE))
-    grey = np.full((SIDE, SIDE, 3), 0.5)
+    gray = np.full((SIDE, SIDE, 3), 0.5)
     # sRGB of 1 and of 0 are 1 apart, and 0.5 from grey: 10 log10(1 / 0.25) = 6.02 dB.
-    found = image_scores("render", 2 * grey, 0 * grey, full)
+    found = image_scores("render", 2 * gray, 0 * gray, full)
     assert found["render_psnr_l"] == pytest.approx(6.0206, abs=1e-4)
 
 

@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates
 from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset import files as files_module
-from tests.data.make_capture import CENTRE, SCALE, srgb
+from tests.data.make_capture import CENTER, SCALE, srgb
 from tests.export.asset.balls import (
     AXIS,
     BULB,
@@ -51,9 +51,9 @@ def shape(asset: Path) -> trimesh.Trimesh:
 
 
 def to_scene(gltf: np.ndarray) -> np.ndarray:
-    """(x, y, z) of glTF is (x, −z, y) of the world; one scene unit is SCALE of the world about CENTRE."""
+    """(x, y, z) of glTF is (x, −z, y) of the world; one scene unit is SCALE of the world about CENTER."""
     x, y, z = gltf.T
-    return (np.stack([x, -z, y], axis=1) - CENTRE) / SCALE
+    return (np.stack([x, -z, y], axis=1) - CENTER) / SCALE
 
 
 def random_points(shape: trimesh.Trimesh, count: int = 4000):
@@ -120,8 +120,8 @@ def test_the_surface_is_upright_and_faces_outwards(shape):
     scene = to_scene(np.array(shape.vertices))
     np.testing.assert_allclose(np.linalg.norm(scene, axis=1), RADIUS, atol=0.02)
     # The first camera is above the sphere, on the side of +X: the sphere is complete there, but not below.
-    from_centre = np.array(shape.vertices) - np.array([CENTRE[0], CENTRE[2], -CENTRE[1]])
-    cosine = (np.array(shape.vertex_normals) * from_centre).sum(1) / np.linalg.norm(from_centre, axis=1)
+    from_center = np.array(shape.vertices) - np.array([CENTER[0], CENTER[2], -CENTER[1]])
+    cosine = (np.array(shape.vertex_normals) * from_center).sum(1) / np.linalg.norm(from_center, axis=1)
     assert cosine.min() > 0.95
     assert ((shape.face_normals * (shape.triangles_center - shape.vertices.mean(0))).sum(1) > 0).all()
 

@@ -12,10 +12,9 @@ import trimesh
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import read_image
-from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.run import load_run
-from tests.commands.calls import refused
-from tests.data.make_capture import CENTRE, RADIUS, SCALE, make_capture, srgb
+from tests.calls import refused, train_tiny
+from tests.data.make_capture import CENTER, RADIUS, SCALE, srgb
 from tests.train.small_runs import small_config, solved_light
 
 SMALL = ["--device", "cpu", "--texture-size", "128", "--faces", "400", "--resolution", "32"]
@@ -24,27 +23,10 @@ MAPS = {"environment.exr", "environment_blender.exr", "environment_unreal.exr"}
 
 
 @pytest.fixture(scope="module")
-def given(tmp_path_factory) -> Path:
+def given(tmp_path_factory, masked_capture) -> Path:
     """A run on a given mesh, with an environment map."""
-    folder = tmp_path_factory.mktemp("given")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", lambda: solved_light(small_config()))
-        capture = make_capture(folder / "capture", masks=True)
-        command = [
-            "train",
-            "--data",
-            capture,
-            "--preset",
-            "tiny",
-            "--host",
-            "mesh",
-            "--out",
-            folder / "run",
-            "--device",
-            "cpu",
-        ]
-        assert main(list(map(str, command))) == 0
-    return folder / "run"
+    out = tmp_path_factory.mktemp("given") / "run"
+    return train_tiny(masked_capture, out, "--host", "mesh", config=lambda: solved_light(small_config()))
 
 
 def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
@@ -68,7 +50,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     shape = trimesh.load(out / "asset.glb", process=False).geometry["surface"]
     assert len(shape.faces) <= 400
     world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
-    np.testing.assert_allclose(np.linalg.norm(world - CENTRE, axis=1), RADIUS, atol=0.04)
+    np.testing.assert_allclose(np.linalg.norm(world - CENTER, axis=1), RADIUS, atol=0.04)
     # The texture agrees with the material of the run.
     run = load_run(given)
     row = (1 - shape.visual.uv[:, 1]) * 128 - 0.5
@@ -76,7 +58,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
     texel = np.array(shape.visual.material.baseColorTexture)[
         row.round().astype(int), column.round().astype(int)
     ]
-    scene = torch.as_tensor((world - CENTRE) / SCALE, dtype=torch.float32)
+    scene = torch.as_tensor((world - CENTER) / SCALE, dtype=torch.float32)
     truth = 255 * srgb(run.model.materials(scene).base_color.detach().numpy())
     assert np.abs(texel - truth).mean() < 2
     described = json.loads((out / "scene.json").read_text())
@@ -104,13 +86,8 @@ def test_bad_options(given, tmp_path, capfd, options, words):
     refused(capfd, command, *words, leaves=tmp_path)
 
 
-def test_a_run_without_a_material(tmp_path, capfd, monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", small_config)
-    capture = make_capture(tmp_path / "capture", masks=True)
-    run = tmp_path / "run"
-    assert (
-        main(["train", "--data", str(capture), "--preset", "tiny", "--out", str(run), "--device", "cpu"]) == 0
-    )
+def test_a_run_without_a_material(masked_capture, tmp_path, capfd):
+    run = train_tiny(masked_capture, tmp_path / "run")
     command = ["export", run, "--what", "asset", "--checkpoint", "sdf_init", *SMALL]
     refused(capfd, command, "no material yet at step 4", leaves=tmp_path)
     # A later step has a material, on the recovered surface; the light is free at every point, so there is
@@ -120,4 +97,4 @@ def test_a_run_without_a_material(tmp_path, capfd, monkeypatch):
     assert {path.name for path in out.iterdir()} - {"asset.usda"} == FILES | {"textures"}
     shape = trimesh.load(out / "asset.glb", process=False).geometry["surface"]
     world = np.array(shape.vertices)[:, [0, 2, 1]] * [1, -1, 1]
-    assert np.linalg.norm(world.mean(0) - CENTRE) < 0.4 * RADIUS
+    assert np.linalg.norm(world.mean(0) - CENTER) < 0.4 * RADIUS

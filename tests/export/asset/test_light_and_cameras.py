@@ -20,7 +20,7 @@ from neilfpp_method.export.asset.environment import equirectangular
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.run import Run
-from tests.data.make_capture import CENTRE, SCALE
+from tests.data.make_capture import CENTER, SCALE
 from tests.export.asset.balls import BULB, PANEL, RADIUS, ball_run, material, write_ball
 from tests.scenes import meet_ball
 
@@ -122,7 +122,7 @@ def test_cameras_are_those_of_the_capture(run, asset):
         pixel = row * camera["width"] + column
         np.testing.assert_allclose(direction / np.linalg.norm(direction), rays.directions[pixel], atol=1e-6)
         np.testing.assert_allclose(pose[:3, 3], rays.origins[pixel], atol=1e-6)
-    np.testing.assert_allclose(described["lamps"][0]["position"], CENTRE + SCALE * np.array(BULB), atol=1e-6)
+    np.testing.assert_allclose(described["lamps"][0]["position"], CENTER + SCALE * np.array(BULB), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["open_in_blender.py", "open_in_mitsuba.py"])

@@ -28,9 +28,9 @@ def camera(height: float, size: int = 40) -> Camera:
     return Camera(float(size), float(size), size / 2, size / 2, size, size, w2c)
 
 
-def ball(centre: tuple[float, float, float], radius: float, subdivisions: int = 3) -> trimesh.Trimesh:
+def ball(center: tuple[float, float, float], radius: float, subdivisions: int = 3) -> trimesh.Trimesh:
     shape = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    shape.apply_translation(centre)
+    shape.apply_translation(center)
     return shape
 
 

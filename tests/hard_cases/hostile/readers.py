@@ -217,7 +217,7 @@ def _read_capture(folder: Path, damaged: Path) -> None:
     assert capture.point_cloud is None or capture.point_cloud.resolve().is_relative_to(inside)
     assert np.isfinite(capture.normalisation.scale)
     assert capture.normalisation.scale > 0
-    assert np.isfinite(capture.normalisation.centre).all()
+    assert np.isfinite(capture.normalisation.center).all()
     pixels = PixelDataset(capture, capture.views)
     batch = pixels.sample(16)
     assert batch.color.isfinite().all()

@@ -1,14 +1,27 @@
-"""Call the command line, and check how it refuses."""
+"""Call the command line: train a tiny run, and check how a command refuses bad input."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from neilfpp_method.cli import main
+from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.settings.types import NeilfConfig
+from tests.train.small_runs import small_config
 
 
-def train(*options: object) -> int:
-    return main(["train", "--preset", "tiny", "--device", "cpu", *map(str, options)])
+def train_tiny(
+    capture: Path, out: Path, *options: object, config: Callable[[], NeilfConfig] = small_config
+) -> Path:
+    """Train a run with the command line and return its folder; `config` makes the settings."""
+    command = ["train", "--data", capture, "--out", out, "--preset", "tiny", "--device", "cpu", *options]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", config)
+        assert main([*map(str, command)]) == 0
+    return out
 
 
 def tree(folder: Path) -> dict[Path, bytes | None]:
