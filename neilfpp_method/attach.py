@@ -162,6 +162,10 @@ class AttachedNeilf(nn.Module):
         Raises:
             UserError: as in `losses`.
         """
+        if torch.is_inference_mode_enabled():
+            # Many hosts compute normals by autograd, which inference mode forbids.
+            with torch.inference_mode(False), torch.no_grad():
+                return self.maps(rays if isinstance(rays, Camera) else _cloned(rays), hits)
         if isinstance(rays, Camera):
             if not isinstance(self.model.host, ForeignHost):
                 raise UserError(
@@ -327,7 +331,9 @@ def attach_neilf(
             f"config is a {type(config).__name__}", "give a NeilfConfig, or the name of a preset, as 'fast'"
         )
     facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
-    with torch.random.fork_rng(range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []):
+    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
+    # Parameters that are made in inference mode could never be trained.
+    with torch.inference_mode(False), torch.random.fork_rng(devices):
         proxy = proxy_for(adapted, config)
         complete = adapted if isinstance(adapted, TracesLight) else ForeignHost(adapted, borrowed, proxy)
         attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
@@ -350,6 +356,11 @@ def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:
         parts.append("a proxy of its surface, built from the training rays, traces light between surfaces")
     parts += [f"no {method}: {consequence}" for method, consequence in attached.missing.items()]
     return "; ".join(parts) or "it has all optional methods"
+
+
+def _cloned(rays: RayBatch) -> RayBatch:
+    """Copies of rays that are not inference tensors, so that a host may compute gradients with them."""
+    return RayBatch(rays.origins.clone(), rays.directions.clone())
 
 
 def _inner(host: object) -> object:

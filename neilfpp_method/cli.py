@@ -16,7 +16,7 @@ from rich.console import Console
 
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
-from neilfpp_method.commands.ending import ended_by_signal
+from neilfpp_method.commands.ending import CLOSED_OUTPUT, ended_by_signal, output_is_closed
 from neilfpp_method.commands.mistakes import TYRO_UNKNOWN, closest, mistake
 from neilfpp_method.data.native_signals import sigterm_delayed
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
@@ -31,7 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the words of the command line; None for those of the process.
 
     Returns:
-        The exit status: 0 for success, 2 for bad input, 130 after Ctrl-C, 143 after SIGTERM, 1 otherwise.
+        The exit status: 0 for success, 2 for bad input, 130 after Ctrl-C, 141 if standard output was closed,
+        143 after SIGTERM, 1 otherwise.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -44,6 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             _run(arguments[0], arguments[1:])
         except EarlyEnd as end:
+            if isinstance(end.__cause__, BrokenPipeError) and output_is_closed():
+                return CLOSED_OUTPUT
             text = str(end) if isinstance(end, Stopped) else f"error: {end}"
             errors.print(text, highlight=False, soft_wrap=True, markup=False)
             return end.status if first else 0

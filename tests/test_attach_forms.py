@@ -18,6 +18,7 @@ from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.scenes import tiny_config
 from tests.test_attach import pixels
+from tests.train.small_runs import solved_light
 
 
 class TrainedBall(BallHost):
@@ -142,6 +143,79 @@ def test_a_scene_in_other_units_is_an_error():
     batch = dataclasses.replace(batch, origins=40.0 * batch.origins + by)
     with pytest.raises(UserError, match=r"half of its hits are .* or more from the origin; move and scale"):
         attach_neilf(far, tiny_config()).losses(batch, Stage.MATERIAL_INIT)
+
+
+def with_background(origins, directions):
+    """A ball in front of a distant sphere that counts as a surface."""
+    color, position, normal = Ball()(origins, directions)
+    hit = normal.norm(dim=-1, keepdim=True) > 0.5
+    return (
+        torch.where(hit, color, 0.3),
+        torch.where(hit, position, origins + 50.0 * directions),
+        torch.where(hit, normal, -directions),
+    )
+
+
+def test_a_distant_background_that_counts_as_a_surface_is_reported(caplog):
+    with caplog.at_level(logging.WARNING):
+        attach_neilf(with_background, tiny_config()).losses(pixels(spread=0.5), Stage.MATERIAL_INIT)
+    assert any("of its hits are 10 or more from the origin" in r.getMessage() for r in caplog.records)
+    with pytest.raises(UserError, match="distant background, give its rays a concentration of 0"):
+        attach_neilf(with_background, tiny_config()).losses(pixels(spread=1.2), Stage.MATERIAL_INIT)
+
+
+class AutogradNormals(Ball):
+    """Computes its normals by autograd, as density and distance fields do."""
+
+    def forward(self, origins, directions):
+        color, position, normal = super().forward(origins, directions)
+        with torch.enable_grad():
+            x = (origins + (position - origins)).detach().requires_grad_(True)
+            slope = torch.autograd.grad(x.norm(dim=-1).sum(), x)[0]
+        return color, position, torch.where(normal.norm(dim=-1, keepdim=True) > 0.5, slope, 0.0)
+
+
+def test_inference_mode():
+    """Maps can be rendered in it although hosts need autograd; what is attached in it can be trained."""
+    host, rays = AutogradNormals(), ball_rays(16)
+    with torch.inference_mode():
+        neilf = attach_neilf(host, tiny_config())
+    neilf.losses(pixels(), Stage.JOINT).loss.backward()
+    neilf.eval()
+    with torch.inference_mode():
+        maps = neilf.maps(RayBatch(rays.origins + 0.0, rays.directions + 0.0))
+    assert maps.normal.norm(dim=-1).max() > 0.5
+    assert not maps.base_color.requires_grad
+
+
+def test_a_module_with_a_proxy_changes_its_precision_during_training():
+    host = Ball()
+    neilf = attach_neilf(host, solved_light(tiny_config()))
+    for _ in range(3):
+        neilf.losses(pixels(), Stage.MATERIAL_INIT)
+    assert neilf.proxy.scene_light(torch.zeros(1, 3), torch.ones(1, 1, 3)).distance.dtype == torch.float32
+    neilf.double(), host.double()
+    batch = pixels()
+    floats = {f.name: getattr(batch, f.name) for f in dataclasses.fields(batch)}
+    batch = dataclasses.replace(
+        batch, **{name: t.double() for name, t in floats.items() if t.is_floating_point()}
+    )
+    for _ in range(3):
+        total = neilf.losses(batch, Stage.MATERIAL_INIT)
+        total.loss.backward()
+    assert total.loss.dtype == torch.float64
+
+
+def test_a_checkpoint_of_another_precision_is_read():
+    trained = attach_neilf(Ball(), solved_light(tiny_config()))
+    for _ in range(3):
+        trained.losses(pixels(), Stage.MATERIAL_INIT)
+    state = trained.state_dict()
+    fresh = attach_neilf(Ball().double(), solved_light(tiny_config())).double()
+    fresh.load_state_dict(state)
+    assert fresh.proxy._pending
+    assert {rays.origins.dtype for rays, _ in fresh.proxy._pending} == {torch.float64}
+    fresh.proxy.refresh()
 
 
 # -------------------------------------------------------------------------------------- forms of batches

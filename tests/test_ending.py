@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,3 +86,15 @@ def test_a_stopped_write_keeps_the_old_file(monkeypatch, tmp_path: Path):
     assert main(command(monkeypatch, work)) == 143
     assert [file.name for file in tmp_path.iterdir()] == ["result.txt"]
     assert path.read_text() == "whole"
+
+
+def test_output_that_is_no_longer_read_is_no_error():
+    """As in `neilfpp train --help-all | head -1`."""
+    code = (
+        "import sys, time; from neilfpp_method.cli import main; time.sleep(0.2);"
+        "sys.exit(main(['train', '--help-all']))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    assert process.wait() == 141

@@ -1,12 +1,18 @@
-"""Handle Ctrl-C and SIGTERM, so that a command ends without a traceback."""
+"""Handle Ctrl-C, SIGTERM and a closed standard output, so that a command ends without a traceback."""
 
 from __future__ import annotations
 
+import os
+import select
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-__all__ = ["EndSignal", "ended_by_signal"]
+__all__ = ["CLOSED_OUTPUT", "EndSignal", "ended_by_signal", "output_is_closed"]
+
+CLOSED_OUTPUT = 141
+"""The exit status that shells report for a process whose output is no longer read: 128 + SIGPIPE."""
 
 
 class EndSignal:
@@ -44,3 +50,13 @@ def ended_by_signal() -> Iterator[EndSignal]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def output_is_closed() -> bool:
+    """Return whether the reader of standard output has ended, as `head` does; the rest is then discarded."""
+    poll = select.poll()
+    poll.register(sys.stdout.fileno(), 0)
+    is_closed = any(event & select.POLLERR for _, event in poll.poll(0))
+    if is_closed:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return is_closed

@@ -1,8 +1,9 @@
 """OpenEXR files: choose the part and the channels that are the image, and place its pixels in the frame.
 
-Renderers store many layers in one file. The image is the first of these that exists: R, G, B in any part; R,
-G, B of the only layer that has them, or of Blender's layer "Combined" if there are several; X, Y, Z; a single
-channel. The alpha channel of the same layer belongs to it.
+Renderers store many layers in one file. The image is the first of these that exists: R, G, B in the part that
+is called Combined, rgba, rgb or beauty; R, G, B in any part; R, G, B of the only layer that has them, or of
+Blender's layer "Combined" if there are several; X, Y, Z; a single channel. The alpha channel of the same
+layer belongs to it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ COLORS, ALPHA = ("R", "G", "B"), "A"
 VECTOR = ("X", "Y", "Z")
 SINGLE = (("Y",), ("Z",))
 COMBINED = "Combined"
+MAIN_PARTS = ("combined", "rgba", "rgb", "beauty")
+"""Names of the part that is the image in Blender, Nuke and other renderers, in small letters; a layer may
+stand before it, as in "ViewLayer.Combined"."""
 CHROMA = "RY"
 """Chroma channel of luminance/chroma images, stored at half the resolution. They are not supported."""
 
@@ -59,7 +63,8 @@ def exr_header(path: Path) -> ExrHeader:
         UserError: no part has channels of an image.
     """
     parts = OpenEXR.File(str(path), header_only=True).parts
-    picture = _picture(path, [[channel.name for channel in part.header["channels"]] for part in parts])
+    listed = [[channel.name for channel in part.header["channels"]] for part in parts]
+    picture = _picture(path, listed, [_part_name(part) for part in parts])
     frame = Window.of(parts[picture.part].header["displayWindow"])
     return ExrHeader(frame, tuple(Window.of(part.header["dataWindow"]) for part in parts))
 
@@ -77,7 +82,7 @@ def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
     if not parts:
         raise ValueError("damaged, or cut off")
     channels = [part.channels for part in parts]
-    picture = _picture(path, channels)
+    picture = _picture(path, channels, [_part_name(part) for part in parts])
     stored = np.stack(
         [channels[picture.part][name].pixels.astype(np.float32) for name in picture.channels], axis=-1
     )
@@ -101,7 +106,14 @@ class Picture:
     channels: tuple[str, ...]
 
 
-def _picture(path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]]) -> Picture:
+def _part_name(part: OpenEXR.Part) -> str:
+    """The name of a part; empty for the part of a file that has one part only."""
+    return str(part.header.get("name", ""))
+
+
+def _picture(
+    path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]], part_names: Sequence[str]
+) -> Picture:
     layers = {f"{prefix}.": part for part, names in enumerate(parts) for prefix in _layers(names)}
     combined = [layer for layer in layers if layer.split(".")[-2] == COMBINED]
     (layer,) = combined if len(combined) == 1 else layers if len(layers) == 1 else ("",)
@@ -112,11 +124,17 @@ def _picture(path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]]) 
         *(("", names) for names in (VECTOR, *SINGLE, *alone)),
     ):
         channels = tuple(prefix + name for name in wanted)
-        for part, names in enumerate(parts):
+        for part in sorted(range(len(parts)), key=lambda i: not _is_main(part_names[i])):
+            names = parts[part]
             if set(channels) <= set(names) and CHROMA not in names:
                 return Picture(part, channels + ((prefix + ALPHA,) if prefix + ALPHA in names else ()))
     listed = ", ".join(name for names in parts for name in sorted(names))
     raise UserError(f"{path}: no RGB or single channel among {listed}", "store the image as R, G, B")
+
+
+def _is_main(part: str) -> bool:
+    """Whether the name of a part says that it is the image and not one of its components."""
+    return part.rpartition(".")[2].lower() in MAIN_PARTS
 
 
 def _layers(names: Sequence[str] | Mapping[str, object]) -> list[str]:

@@ -40,8 +40,10 @@ MAX_PIXELS = 2**30
 """Largest number of pixels of an image; bounds the memory."""
 LABEL = 1.001 / 255
 """Largest value of a mask file, in [0, 1], at which it contains labels instead of brightness: 1 of 255."""
-RADIANCE_HEADER = 4096
-"""Largest size of the header of a Radiance HDR file, in bytes."""
+RADIANCE_HEADER = 65_536
+"""Largest size of the header of a Radiance HDR file, in bytes. Tools append their command lines to it."""
+SIGNATURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
+"""First bytes of PNG and JPEG files, which are recognised by them, because renamed files are common."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,8 @@ def _radiance_lines(path: Path) -> list[bytes]:
     """The lines of the header, an empty line, and the line with the size."""
     with path.open("rb") as file:
         lines = file.read(RADIANCE_HEADER).split(b"\n")
+    if b"" not in lines:
+        raise ValueError(f"its header does not end within {RADIANCE_HEADER} bytes with an empty line")
     return lines[: lines.index(b"") + 2]
 
 
@@ -119,14 +123,16 @@ def _radiance_header(path: Path) -> ImageHeader:
 
 
 def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    """Radiance: stored values are multiplied by every EXPOSURE of the header, which OpenCV does not undo."""
-    exposures = [
-        float(line.split(b"=")[1]) for line in _radiance_lines(path) if line.startswith(b"EXPOSURE=")
-    ]
-    factor = float(np.prod(exposures))
-    if not (np.isfinite(factor) and factor > 0):
-        raise ValueError(f"an exposure of {factor:g}")
-    return _opencv_samples(path) / np.float32(factor)
+    """Radiance: stored values are multiplied by every EXPOSURE of the header, and their channels by every
+    COLORCORR. OpenCV undoes neither.
+    """
+    factors = np.ones(3)
+    for line in _radiance_lines(path):
+        if line.startswith((b"EXPOSURE=", b"COLORCORR=")):
+            factors *= [float(word) for word in line.split(b"=")[1].split()]
+    if not (np.isfinite(factors).all() and (factors > 0).all()):
+        raise ValueError(f"an exposure or a color correction of {factors.min():g}")
+    return _opencv_samples(path) / factors.astype(np.float32)
 
 
 def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
@@ -142,13 +148,28 @@ def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     with tifffile.TiffFile(path) as file:
         page = file.pages[0]
-        if page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1:
-            # OpenCV would silently read the planes as pixels.
-            return np.moveaxis(page.asarray(), 0, -1)
-        if page.dtype == np.float16:
-            # OpenCV does not support half precision in TIFF.
-            return np.atleast_3d(page.asarray())
+        if page.photometric.name not in TIFF_COLORS:
+            raise ValueError(f"its colours are {page.photometric.name}, not RGB")
+        is_plain = page.compression.name in TIFF_UNPACKED and page.predictor in TIFF_PREDICTORS
+        if is_plain and page.photometric.name in TIFF_STORED and page.bitspersample in TIFF_BITS:
+            # OpenCV multiplies 8-bit colours by an alpha that is not associated, refuses rotated images and
+            # further channels, does not support half precision, and reads separate planes as pixels.
+            samples = page.asarray()
+            is_planar = page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1
+            samples = np.atleast_3d(np.moveaxis(samples, 0, -1) if is_planar else samples)
+            return _colors_and_alpha(samples, 3 if page.photometric.name == "RGB" else 1, page.extrasamples)
+        if ALPHA_APART in page.extrasamples and page.dtype == np.uint8:
+            raise ValueError(f"{page.compression.name} compression with an alpha that is not associated")
     return _opencv_samples(path)
+
+
+def _colors_and_alpha(
+    samples: Shaped[np.ndarray, "H W C"], colors: int, extra: tuple[int, ...]
+) -> Shaped[np.ndarray, "H W c"]:
+    """Colours and alpha of a TIFF. A single further channel of unspecified meaning is taken as the alpha."""
+    alpha = [i for i, kind in enumerate(extra) if kind != tifffile.EXTRASAMPLE.UNSPECIFIED]
+    alpha = alpha or [0] * (len(extra) == 1)
+    return samples[..., [*range(colors), *(colors + i for i in alpha[:1])]]
 
 
 def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
@@ -180,6 +201,17 @@ FORMATS: Mapping[str, Format] = {
     ".jpeg": JPEG,
 }
 IMAGE_SUFFIXES = tuple(FORMATS)
+TIFF_COLORS = ("MINISBLACK", "MINISWHITE", "RGB", "PALETTE", "SEPARATED", "YCBCR")
+"""Meanings of the colours of a TIFF file that are read."""
+TIFF_STORED = ("MINISBLACK", "RGB")
+"""Meanings of the colours with which stored values are brightness or RGB."""
+TIFF_UNPACKED = ("NONE", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS")
+"""Compressions that tifffile decodes without further packages; OpenCV decodes the others."""
+TIFF_PREDICTORS = (tifffile.PREDICTOR.NONE, tifffile.PREDICTOR.HORIZONTAL)
+"""Predictors that tifffile undoes without further packages."""
+TIFF_BITS = (8, 16, 32, 64)
+"""Sizes of samples that fill the type in which they are decoded."""
+ALPHA_APART = tifffile.EXTRASAMPLE.UNASSALPHA
 FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float16": 1.0, "float32": 1.0, "float64": 1.0}
 
 
@@ -251,11 +283,16 @@ def _decoders_silent() -> Iterator[None]:
 
 
 def _format(path: Path) -> Format:
-    if path.suffix.lower() not in FORMATS:
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
         raise UserError(f"{path}: not an image format that is read", f"use one of {', '.join(FORMATS)}")
     if not path.is_file():
         raise FileNotFoundError
-    return FORMATS[path.suffix.lower()]
+    if FORMATS[suffix].header is _pillow_header:
+        with path.open("rb") as file:
+            start = file.read(4)
+        suffix = next((kind for begin, kind in SIGNATURES.items() if start.startswith(begin)), suffix)
+    return FORMATS[suffix]
 
 
 def _check_size(path: Path, width: int, height: int) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int, Shaped
 
 from neilfpp_method.data.images import replacing
 
-__all__ = ["CODES_BY_NAME", "NORMAL", "POSITION", "write_ply"]
+__all__ = ["CODES_BY_NAME", "NORMAL", "POSITION", "needs_double", "write_ply"]
 
 OLD_NAMES = ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")
 NEW_NAMES = ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")
@@ -46,7 +46,7 @@ def write_ply(
     Returns:
         The path.
     """
-    kind = "<f8" if _needs_double(position) else "<f4"
+    kind = "<f8" if needs_double(position) else "<f4"
     properties = {
         name: column.astype(kind) for name, column in zip(POSITION, position.T, strict=True)
     } | columns
@@ -66,7 +66,8 @@ def write_ply(
     return path
 
 
-def _needs_double(position: Float[np.ndarray, "N 3"]) -> bool:
+def needs_double(position: Float[np.ndarray, "N 3"]) -> bool:
+    """Whether single precision would move a position by more than `ROUNDING` of the extent of all."""
     if not len(position):
         return False
     moved = np.abs(position.astype(np.float32) - position).max()

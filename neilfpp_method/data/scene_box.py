@@ -35,6 +35,10 @@ CELLS = 32
 REFINEMENTS = 3
 """Number of grids, each of which covers the hull that the previous one found."""
 
+SAME_PLACE = 1e-10
+"""Extent of the camera centres, relative to their largest coordinate, below which they are one point that was
+computed with rounding errors."""
+
 REACH = 0.55
 """Ratio of the radius of a box around the focus of the cameras to their median distance from it. Half of the
 cameras are then at least 1.8 scene units away, and a camera at three quarters of the median distance is 1.36
@@ -107,7 +111,7 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     The centre is the point that most cameras look at, or else the least-squares point of all optical axes.
 
     Raises:
-        UserError: the axes are parallel, or meet behind the cameras.
+        UserError: the axes are parallel or meet behind the cameras, or the cameras are at one point.
     """
     where = views[0].image.parent
     axes, focus = axes_of(views), find_focus(views)
@@ -116,6 +120,12 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
         raise UserError(
             f"{where}: the cameras look in one direction, so the position of the scene is unknown",
             "add points or a scene box",
+        )
+    spread = np.ptp(axes.eyes, axis=0).max()
+    if spread <= SAME_PLACE * np.abs(axes.eyes).max():
+        raise UserError(
+            f"{where}: all cameras are at one point, so the position of the scene is unknown",
+            "take photographs from several sides, or add a scene box",
         )
     depth = np.einsum("ni,ni->n", center - axes.eyes, axes.ahead)
     if np.median(depth) <= 0:

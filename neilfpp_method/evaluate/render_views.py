@@ -79,11 +79,15 @@ def view_names(capture: Capture, views: str | Collection[str]) -> frozenset[str]
     """Resolve "test", "train", "all" or names of views to a set of names.
 
     Raises:
-        UserError: the capture has no such view.
+        UserError: the capture has no such view, or the group is empty.
     """
     existing = frozenset(view.name for view in capture.views)
     groups = {"all": existing, "test": capture.test, "train": existing - capture.test}
     if isinstance(views, str) and views in groups:
+        if not groups[views]:
+            raise UserError(
+                f"{capture.root}: there is no {views} view", "give --views all, or names of views"
+            )
         return groups[views]
     names = frozenset([views] if isinstance(views, str) else views)
     if missing := sorted(names - existing):

@@ -38,6 +38,10 @@ LOST_DISTANCE = 10.0
 """Median distance of hits from the origin above which nothing can be estimated: the fields of material and
 light end at the scene's bounding box, `volume.radius`.
 """
+MAX_LOST_SHARE = 0.02
+"""Largest share of hits beyond `LOST_DISTANCE`. More of them are a background that counts as a surface."""
+BACKGROUND_MISSES = "give its rays a concentration of 0, and for a function a normal of 0"
+"""Remedy for a background that counts as a surface."""
 MAX_REVIEWED_HITS = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
 VIEWPOINT_TANGENT = 0.6
@@ -187,13 +191,23 @@ class FirstBatches:
                 f"{self.name}: {away:.0%} of its normals point away from the viewer",
                 "turn them outwards: normal = -normal",
             )
-        reach = hits.position[hit].norm(dim=-1).median().item()
+        distance = hits.position[hit].norm(dim=-1)
+        reach = distance.median().item()
+        lost = (distance > LOST_DISTANCE).float().mean().item()
         far = f"half of its hits are {reach:.3g} or more from the origin"
         remedy = "move and scale cameras and host so that the object lies in the unit sphere"
         if reach > LOST_DISTANCE:
-            raise UserError(f"{self.name}: {far}", f"{remedy} (docs/hosts.md, Other units)")
+            background = f"if most rays show a distant background, {BACKGROUND_MISSES}"
+            raise UserError(f"{self.name}: {far}", f"{remedy} (docs/hosts.md, Other units); {background}")
         if reach > MAX_MEDIAN_DISTANCE:
             self._warn("far", far, remedy)
+        elif lost > MAX_LOST_SHARE:
+            self._warn(
+                "background",
+                f"{lost:.0%} of its hits are {LOST_DISTANCE:g} or more from the origin, and their material "
+                "is trained as if they were a surface of the object",
+                f"if they are a distant background, {BACKGROUND_MISSES}",
+            )
 
     @torch.no_grad()
     def _check_another_view(

@@ -117,6 +117,14 @@ class SurfaceProxy(nn.Module):
         """Edge of a cell of the grid, scene units."""
         return 2 * self.radius / (self.resolution - 1)
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SurfaceProxy:
+        """Convert the module: `nn.Module` calls this for `to`, `double` and `cuda`, on any parent as well."""
+        super()._apply(fn, recurse)
+        self._pending = [(_converted(rays, fn), _converted(hits, fn)) for rays, hits in self._pending]
+        # The grid is rebuilt from the converted points at its next use.
+        self._surface = None
+        return self
+
     # ---------------------------------------------------------------------------------------------- gathering
 
     @torch.no_grad()
@@ -307,8 +315,10 @@ class SurfaceProxy(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned; the grid is rebuilt from the points at its next use."""
         self.steps, self._surface, self._report = state["steps"], None, None
+        like = self.points.rows
         self._pending = [
-            (_made(RayBatch, tensors), _made(SurfaceHits, tensors)) for tensors in state["pending"]
+            tuple(_converted(_made(kind, tensors), lambda t: t.to(like)) for kind in (RayBatch, SurfaceHits))
+            for tensors in state["pending"]
         ]
 
 
@@ -322,6 +332,11 @@ def _joined(parts: Sequence[Part]) -> Part:
 
 def _tensors(part: RayBatch | SurfaceHits) -> dict[str, Tensor]:
     return {f.name: getattr(part, f.name) for f in fields(part)}
+
+
+def _converted(part: Part, fn: Callable[[Tensor], Tensor]) -> Part:
+    """The same structure with `fn` applied to each tensor, all of which are floating point."""
+    return type(part)(**{name: fn(tensor) for name, tensor in _tensors(part).items()})
 
 
 def _made(kind: type[Part], tensors: Mapping[str, Tensor]) -> Part:

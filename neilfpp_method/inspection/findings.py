@@ -43,6 +43,9 @@ INVALID_VIEW = 0.5
 """Share of invalid pixels above which a view is reported."""
 MIN_COUNT, ADVISED_COUNT = 3, 16
 """Fewer views than the first are a problem, fewer than the second a warning."""
+BASELINE = 1e-3
+"""Extent of the camera centres below which all cameras are at one point, in scene units: views then have no
+parallax of a pixel."""
 SPARSE_GAP = 25.0
 """Median angle to the nearest view, degrees, above which views are sparse."""
 MIN_COVERAGE = 0.25
@@ -187,7 +190,7 @@ def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: C
         yield Finding(
             "black",
             "problem",
-            "all pixels of the object are black",
+            "all pixels of the object are black, or the whole picture has one colour",
             "leave these views out, or correct the masks",
             black,
         )
@@ -248,7 +251,10 @@ def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Findin
     if count < ADVISED_COUNT:
         severity: Severity = "problem" if count < MIN_COUNT else "warning"
         remedy = f"take {ADVISED_COUNT} or more, better 50, from all around"
-        yield Finding("few_views", severity, f"{count} views", remedy)
+        yield Finding("few_views", severity, f"{count} view{'s' * (count != 1)}", remedy)
+    if count > 1 and np.ptp(placement.centers, axis=0).max() < BASELINE:
+        text = "all cameras are at one point, so the images do not determine the geometry"
+        yield Finding("one_place", "problem", text, "take photographs from several sides")
     if count >= MIN_COUNT and placement.coverage < MIN_COVERAGE:
         text = f"the views cover {100 * placement.coverage:.0f} % of the directions around the object"
         yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")

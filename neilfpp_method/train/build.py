@@ -44,6 +44,9 @@ BRIGHT_QUANTILE = 0.999
 """R also reaches this quantile of the radiance of HDR images. The brightest pixels are excluded because a
 single lamp in view should not set the scale of R.
 """
+LARGE = 2.0
+"""Median distance of a mesh from the centre above which it is too large rather than inside out, scene
+units."""
 VISIBILITY_STRIDE = 67
 """One in this many pixels of every view is traced to check that the cameras see the outside of a mesh."""
 
@@ -163,10 +166,18 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
-    outside = torch.cat([host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]).outside for camera in cameras])
+    met = [host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]) for camera in cameras]
+    outside = torch.cat([crossings.outside for crossings in met])
     if not len(outside):
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
+        reach = torch.cat([crossings.position for crossings in met]).norm(dim=-1).median().item()
+        if reach > LARGE:
+            raise UserError(
+                f"{path}: the cameras are inside of this mesh, half of which is {reach:.3g} or more scene "
+                "units from the centre",
+                "give it in the world frame and the unit of length of the capture",
+            )
         raise UserError(
             f"{path}: the cameras see the inside of this mesh", "reverse the orientation of its faces"
         )

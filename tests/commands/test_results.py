@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from typing import get_args, get_type_hints
 
 import numpy as np
+import pytest
 import trimesh
 
 from neilfpp_method.cli import main
 from neilfpp_method.commands.evaluate import Eval
+from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image
+from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS
+from neilfpp_method.evaluate.render_views import view_names
 from tests.data.make_capture import CENTER, RADIUS
 
 
@@ -125,3 +130,11 @@ def test_a_run_without_a_name_is_named_after_its_capture(capture, tmp_path, monk
     steps = [f"--config.train.{stage}-steps=1" for stage in ("sdf", "material", "joint")]
     assert main(["train", "--data", str(capture), "--device", "cpu", "--preset=tiny", *steps]) == 0
     assert (tmp_path / "runs" / "sphere-fast" / "config.json").is_file()
+
+
+@pytest.mark.parametrize("group", ["test", "train"])
+def test_a_group_without_views_is_refused(capture, group):
+    loaded = load_capture(capture)
+    chosen = frozenset() if group == "test" else frozenset(view.name for view in loaded.views)
+    with pytest.raises(UserError, match=f"there is no {group} view; give --views all"):
+        view_names(replace(loaded, test=chosen), group)

@@ -69,6 +69,16 @@ def test_the_alpha_is_that_of_the_layer(tmp_path: Path) -> None:
     assert (image.alpha == 0.25).all()
 
 
+@pytest.mark.parametrize("name", ["ViewLayer.Combined", "rgba", "RGB", "beauty"])
+def test_of_several_parts_with_colours_the_name_decides(tmp_path: Path, name: str) -> None:
+    parts = [
+        OpenEXR.Part(dict(SCANLINES), planes("", OTHER), "albedo"),
+        OpenEXR.Part(dict(SCANLINES), planes("", RGB), name),
+    ]
+    OpenEXR.File(parts).write(str(tmp_path / "a.exr"))
+    assert np.array_equal(read_image(tmp_path / "a.exr").pixels, RGB)
+
+
 def test_ambiguous_layers_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "a.exr", {**DIFFUSE, **planes("View.GlossCol.", RGB)})
     for read in (image_header, read_image):

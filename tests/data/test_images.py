@@ -112,8 +112,11 @@ def test_the_exposure_of_a_radiance_file_is_divided_out(tmp_path: Path) -> None:
     before = read_image(path).pixels
     path.write_bytes(path.read_bytes().replace(b"\n\n", b"\nEXPOSURE=0.5\nEXPOSURE= 8.0\n\n", 1))
     assert np.allclose(read_image(path).pixels, before / 4)
+    factors = b"COLORCORR=2.0 1.0 0.25\n\n"
+    path.write_bytes(path.read_bytes().replace(b"\n\n", b"\n" + b"# written by a tool\n" * 400 + factors, 1))
+    assert np.allclose(read_image(path).pixels, before / 4 / [2.0, 1.0, 0.25])
     path.write_bytes(path.read_bytes().replace(b"=0.5", b"=0.0"))
-    with pytest.raises(UserError, match=r"a\.hdr: cannot be read \(an exposure of 0\)"):
+    with pytest.raises(UserError, match=r"a\.hdr: cannot be read \(an exposure or a color correction of 0\)"):
         read_image(path)
 
 
@@ -159,6 +162,56 @@ def test_png_kinds(tmp_path: Path, mode: str) -> None:
     assert np.allclose(
         read_image(tmp_path / "kind.png").pixels, expected[..., : 1 if mode in "L1" else 3], atol=1e-6
     )
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".JPG"])
+def test_png_and_jpeg_are_read_by_their_content(tmp_path: Path, suffix: str) -> None:
+    """A renamed PNG keeps its alpha, and a renamed JPEG that is cut off is refused, not filled with grey."""
+    rgba = np.dstack([BYTES, BYTES[..., :1]])
+    Image.fromarray(rgba).save(tmp_path / f"a{suffix}", format="PNG")
+    image = read_image(tmp_path / f"a{suffix}")
+    assert np.allclose(image.pixels, BYTES / 255, atol=1e-6)
+    assert np.allclose(image.alpha, BYTES[..., 0] / 255, atol=1e-6)
+    Image.fromarray(BYTES).save(tmp_path / "b.jpg", quality=100)
+    (tmp_path / f"c{suffix}").write_bytes((tmp_path / "b.jpg").read_bytes()[:-60])
+    with pytest.raises(UserError, match="cannot be read"):
+        read_image(tmp_path / f"c{suffix}")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_the_colours_of_a_tiff_are_not_multiplied_by_its_alpha(tmp_path: Path, dtype: type) -> None:
+    full = np.iinfo(dtype).max if np.issubdtype(dtype, np.integer) else 1
+    colors, alpha = (BYTES / 255 * full).astype(dtype), (BYTES[..., :1] / 255 * full).astype(dtype)
+    stored = np.dstack([colors, alpha])
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", extrasamples=["unassalpha"])
+    image = read_image(tmp_path / "a.tif")
+    assert np.allclose(image.pixels, colors / full, atol=1e-6)
+    assert np.allclose(image.alpha, alpha[..., 0] / full, atol=1e-6)
+    grey = stored[..., [0, 3]]
+    tifffile.imwrite(
+        tmp_path / "grey.tif",
+        grey,
+        photometric="minisblack",
+        planarconfig="contig",
+        extrasamples=["unassalpha"],
+    )
+    assert np.allclose(read_image(tmp_path / "grey.tif").alpha, alpha[..., 0] / full, atol=1e-6)
+
+
+def test_a_tiff_of_cielab_colours_is_refused(tmp_path: Path) -> None:
+    Image.fromarray(BYTES).convert("LAB").save(tmp_path / "lab.tif")
+    with pytest.raises(UserError, match=r"lab\.tif: cannot be read \(its colours are CIELAB, not RGB\)"):
+        read_image(tmp_path / "lab.tif")
+
+
+def test_a_tiff_with_an_orientation_or_further_channels_is_read_as_stored(tmp_path: Path) -> None:
+    tifffile.imwrite(tmp_path / "a.tif", BYTES, photometric="rgb", extratags=[(274, "H", 1, 6, True)])
+    assert np.allclose(read_image(tmp_path / "a.tif").pixels, BYTES / 255, atol=1e-6)
+    stored = np.dstack([RGB, RGB[..., :2]])
+    tifffile.imwrite(tmp_path / "b.tif", stored, photometric="rgb", extrasamples=["unspecified"] * 2)
+    image = read_image(tmp_path / "b.tif")
+    assert np.array_equal(image.pixels, RGB)
+    assert image.alpha is None
 
 
 def test_jpeg_keeps_the_stored_orientation(tmp_path: Path) -> None:

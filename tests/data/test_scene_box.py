@@ -97,6 +97,21 @@ def test_cameras_that_look_in_one_direction_or_apart_are_refused(tmp_path: Path)
         box_of_cameras(away)
 
 
+def test_cameras_at_one_point_are_refused(tmp_path: Path) -> None:
+    """Their axes meet at the cameras, up to rounding errors, and the box would have a size of 1e-15."""
+    several = views(tmp_path)
+    eye = np.array([5.2, -0.2, 0.3])
+    turned = []
+    for i, view in enumerate(several):
+        w2c = view.camera.w2c.copy()
+        cos, sin = np.cos(0.1 * i), np.sin(0.1 * i)
+        w2c[:3, :3] = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]) @ several[0].camera.w2c[:3, :3]
+        w2c[:3, 3] = -w2c[:3, :3] @ eye
+        turned.append(replace(view, camera=replace(view.camera, w2c=w2c)))
+    with pytest.raises(UserError, match="all cameras are at one point"):
+        find_box(turned)
+
+
 def test_masks_without_a_common_region_are_refused(tmp_path: Path) -> None:
     some = views(tmp_path, masks=True)
     for view in some:

@@ -362,6 +362,8 @@ def test_a_mesh_is_given_by_its_path_and_loaded_again(tmp_path: Path, monkeypatc
     assert "see the inside" in error("--host", "mesh", "--mesh", str(tmp_path / "inside.ply"))
     trimesh.Trimesh(shape.vertices - CENTER + 90.0, shape.faces, process=False).export(tmp_path / "away.ply")
     assert "no camera sees this mesh" in error("--host", "mesh", "--mesh", str(tmp_path / "away.ply"))
+    trimesh.Trimesh(100.0 * shape.vertices, shape.faces, process=False).export(tmp_path / "mm.ply")
+    assert "the unit of length of the capture" in error("--host", "mesh", "--mesh", str(tmp_path / "mm.ply"))
 
     out = tmp_path / "run"
     assert main([*common, str(out), "--host", "mesh", "--mesh", str(tmp_path / "scan.ply")]) == 0

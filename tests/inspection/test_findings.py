@@ -154,6 +154,17 @@ def test_black_views(capture: Capture) -> None:
     assert found(capture) == {"black": (capture.views[VICTIM].name,)}
 
 
+def test_cameras_at_one_point(capture: Capture) -> None:
+    eye = capture.views[0].camera.c2w[:, 3]
+    views = []
+    for view in capture.views:
+        w2c = view.camera.w2c.copy()
+        w2c[:3, 3] = -w2c[:3, :3] @ eye
+        views.append(replace(view, camera=replace(view.camera, w2c=w2c)))
+    placed = replace(capture, views=tuple(views))
+    assert any("all cameras are at one point" in line for line in problems_of_poses(placed))
+
+
 def test_too_few_views_from_one_side(capture: Capture) -> None:
     assert set(found(replace(capture, views=capture.views[:2]))) == {"few_views"}
     near = sorted(

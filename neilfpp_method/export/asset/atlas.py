@@ -8,6 +8,7 @@ import numpy as np
 import xatlas
 from jaxtyping import Float, Int
 
+from neilfpp_method.data.ply import needs_double
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.surface import Surface
 
@@ -38,6 +39,17 @@ class Unwrapped:
     faces: Int[np.ndarray, "F 3"]
     charts: int
     gap: float
+
+    @property
+    def origin(self) -> Float[np.ndarray, " 3"]:
+        """The point from which GLB and USD count their positions, which are in single precision.
+
+        It is the origin of the frame, unless rounding would move vertices noticeably, as in map coordinates;
+        then it is the centre of the bounding box.
+        """
+        if not needs_double(self.vertices):
+            return np.zeros(3)
+        return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
 
 def unwrap(surface: Surface, size: int) -> Unwrapped:

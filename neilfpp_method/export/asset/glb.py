@@ -51,7 +51,7 @@ def glb_bytes(mesh: Unwrapped, textures: Textures, lamps: Sequence[Mapping[str, 
     tangents = vertex_tangents(mesh)
     rotated = np.concatenate([tangents[:, :3] @ WORLD_TO_GLTF.T, tangents[:, 3:]], axis=1)
     shape = trimesh.Trimesh(
-        mesh.vertices @ WORLD_TO_GLTF.T,
+        (mesh.vertices - mesh.origin) @ WORLD_TO_GLTF.T,
         mesh.faces,
         vertex_normals=mesh.normals @ WORLD_TO_GLTF.T,
         visual=TextureVisuals(uv=mesh.uv, material=material),
@@ -66,7 +66,9 @@ def glb_bytes(mesh: Unwrapped, textures: Textures, lamps: Sequence[Mapping[str, 
         if lamps:
             _add_lamps(tree, lamps)
 
-    scene = trimesh.Scene({"surface": shape})
+    scene = trimesh.Scene()
+    placed = trimesh.transformations.translation_matrix(WORLD_TO_GLTF @ mesh.origin)
+    scene.add_geometry(shape, node_name="surface", geom_name="surface", transform=placed)
     return export_glb(scene, include_normals=True, tree_postprocessor=postprocess)
 
 

@@ -36,14 +36,17 @@ def usd_text(mesh: Unwrapped, lamps: Sequence[Mapping[str, Any]]) -> str:
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/asset").GetPrim())
     shape = UsdGeom.Mesh.Define(stage, "/asset/surface")
-    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
+    points = (mesh.vertices - mesh.origin).astype(np.float32)
+    if mesh.origin.any():
+        shape.AddTranslateOp().Set(Gf.Vec3d(*mesh.origin.tolist()))
+    shape.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     shape.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     shape.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(mesh.faces.astype(np.int32).ravel()))
     shape.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(mesh.normals.astype(np.float32)))
     shape.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     shape.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     shape.CreateDoubleSidedAttr(True)
-    extent = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]).astype(np.float32)
+    extent = np.stack([points.min(0), points.max(0)])
     shape.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
     texture_coordinates = UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
         "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex

@@ -5,6 +5,7 @@ from.
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import struct
@@ -19,6 +20,10 @@ from scipy.ndimage import map_coordinates
 from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset import files as files_module
+from neilfpp_method.export.asset.atlas import Unwrapped
+from neilfpp_method.export.asset.bake import Textures
+from neilfpp_method.export.asset.glb import WORLD_TO_GLTF, glb_bytes
+from neilfpp_method.export.asset.usd import has_usd, usd_text
 from tests.data.make_capture import CENTER, SCALE, srgb
 from tests.export.asset.balls import (
     AXIS,
@@ -242,6 +247,31 @@ def test_usd_can_be_read(asset, shape):
 
 
 # ------------------------------------------------------------------------------------------------ bad weather
+
+
+def test_an_asset_far_from_the_origin_keeps_its_shape():
+    """In map coordinates single precision has steps of half a metre."""
+    ball, place = trimesh.creation.icosphere(subdivisions=2, radius=0.15), np.array([5e5, 4e6, 100.0])
+    uv = np.random.default_rng(0).uniform(size=(len(ball.vertices), 2))
+    normals = np.array(ball.vertex_normals)
+    mesh = Unwrapped(np.array(ball.vertices) + place, normals, uv, np.array(ball.faces), 1, 2.0)
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    textures = Textures(pixels, pixels[..., :1], pixels[..., :1], pixels, 1.0, None)
+    scene = trimesh.load(io.BytesIO(glb_bytes(mesh, textures, [])), file_type="glb", process=False)
+    (node,) = scene.graph.nodes_geometry
+    transform, name = scene.graph[node]
+    shape = scene.geometry[name]
+    assert np.allclose(transform[:3, 3], WORLD_TO_GLTF @ place, atol=1e-3)
+    assert np.allclose(shape.vertices @ WORLD_TO_GLTF, ball.vertices, atol=1e-6)
+    if has_usd():
+        from pxr import Usd, UsdGeom
+
+        stage = Usd.Stage.CreateInMemory()
+        stage.GetRootLayer().ImportFromString(usd_text(mesh, []))
+        surface = UsdGeom.Mesh(stage.GetPrimAtPath("/asset/surface"))
+        assert np.allclose(surface.GetPointsAttr().Get(), ball.vertices, atol=1e-6)
+        moved = surface.ComputeLocalToWorldTransform(0).ExtractTranslation()
+        assert np.allclose(moved, place, atol=1e-3)
 
 
 def test_a_full_disk_leaves_nothing(tmp_path, monkeypatch):
