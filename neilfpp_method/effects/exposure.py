@@ -103,13 +103,13 @@ def _split_by_orientation(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
     if not len(normal):
         return group
     common = torch.nn.functional.normalize(normal.sum(0), dim=0)
-    centre = torch.stack((common, normal[(normal @ common).argmin()]))
+    center = torch.stack((common, normal[(normal @ common).argmin()]))
     for _ in range(SPLITS):
-        group = (normal @ centre.T).argmax(1) == 1
+        group = (normal @ center.T).argmax(1) == 1
         if group.all() or not group.any():
             break
         means = torch.stack((normal[~group].mean(0), normal[group].mean(0)))
-        centre = torch.nn.functional.normalize(means, dim=-1)
+        center = torch.nn.functional.normalize(means, dim=-1)
     return group
 
 

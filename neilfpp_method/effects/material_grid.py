@@ -20,7 +20,7 @@ __all__ = [
     "BestMaterials",
     "best_materials",
     "mean_loss",
-    "neighbours",
+    "neighbors",
     "on_grid",
     "outgoing_radiance",
     "relative_error",
@@ -64,7 +64,7 @@ def on_grid(
     return Material(base_color, *values)
 
 
-def neighbours(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"]:
+def neighbors(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"]:
     """Indices of the nearest places of each place, including itself: this share of all places."""
     count = max(1, min(len(features), round(share * len(features))))
     return torch.cdist(features, features).topk(count, largest=False).indices
@@ -104,7 +104,7 @@ def best_materials(
         places: the places with their pixels, in linear radiance.
         typical: radiance of a typical pixel.
         metallics: values of metallic that are tried, the first ones of `METALLICS`.
-        near: indices of the neighbours of each place, including itself (`neighbours`).
+        near: indices of the neighbours of each place, including itself (`neighbors`).
     """
     diffuse, unit = arriving[0], places.observed.pixel + FLOOR * typical
     lowest = torch.full((places.count,), torch.inf, device=unit.device)

@@ -23,7 +23,7 @@ from neilfpp_method.effects.material_grid import (
     ROUGHNESSES,
     best_materials,
     mean_loss,
-    neighbours,
+    neighbors,
     on_grid,
     outgoing_radiance,
     relative_error,
@@ -56,7 +56,7 @@ pixels (measured on `spot_city`: 22 of 105 s).
 """
 DRAWS = 2
 """Random directions per texel and pixel."""
-NEIGHBOURS_SHARE = 1 / 150
+NEIGHBORS_SHARE = 1 / 150
 """Share of the places whose errors are added when the material of a place is chosen."""
 COLOR_SCALE = 0.2
 """Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
@@ -132,7 +132,7 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     current, typical = model.brdf(position), model.facts.median_radiance
     arriving = _arriving(model, places, position)
     look = COLOR_SCALE * current.base_color.clamp_min(MIN_BASE_COLOR).log()
-    near = neighbours(torch.cat((position, look), -1), NEIGHBOURS_SHARE)
+    near = neighbors(torch.cat((position, look), -1), NEIGHBORS_SHARE)
     loss = _loss_of(current, arriving, places, typical, near)
     best = best_materials(arriving, places, typical, METALLICS, near)
     found = on_grid(best.base_color, best.roughness, best.metallic)

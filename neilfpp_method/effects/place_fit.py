@@ -24,7 +24,7 @@ from neilfpp_method.effects.material_grid import (
     MIN_BASE_COLOR,
     ROUGHNESSES,
     best_materials,
-    neighbours,
+    neighbors,
     on_grid,
     outgoing_radiance,
     relative_error,
@@ -70,7 +70,7 @@ HIGH_BASE_COLOR_WEIGHT = 1.0
 """Weight of that penalty, the mean squared excess."""
 SCALE_WEIGHT = 10.0
 """Weight of the squared deviation of the mean log base colour from its given value."""
-NEIGHBOURS_SHARE = 1 / 200
+NEIGHBORS_SHARE = 1 / 200
 """Share of the places whose errors are added when roughness and metallic of a place are chosen. The views of
 one place hardly determine them, and neighbouring places are often of one material.
 """
@@ -173,7 +173,7 @@ def fit_places(
     """
     base_color = START_BASE_COLOR if mean_base_color is None else mean_base_color
     fit = _even_start(places, typical, base_color) if start is None else start
-    near = neighbours(places.mean(places.observed.position), NEIGHBOURS_SHARE)
+    near = neighbors(places.mean(places.observed.position), NEIGHBORS_SHARE)
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS
         fit = _better_light(fit, places, transport, typical, steps, mean_base_color, form)

@@ -89,12 +89,12 @@ class PlaceSolver(nn.Module):
         """
         observed = Observed(*self.points.kept().split(3, -1))
         count = len(observed)
-        centre = observed[torch.randperm(count, device=observed.position.device)[:PLACES]]
-        distance = torch.cdist(observed.position, centre.position)
+        center = observed[torch.randperm(count, device=observed.position.device)[:PLACES]]
+        distance = torch.cdist(observed.position, center.position)
         place = distance.argmin(1) if count else distance.new_zeros(0, dtype=torch.long)
-        same = (observed.normal * centre.normal[place]).sum(-1) > SAME_NORMAL
+        same = (observed.normal * center.normal[place]).sum(-1) > SAME_NORMAL
         fold = torch.arange(count, device=place.device) % FOLDS
-        places = Places(len(centre), place, fold, observed)
+        places = Places(len(center), place, fold, observed)
         return places.where(torch.nonzero(same)[:, 0]).in_views(MIN_PIXELS)
 
     def _start_light(self, model: NeilfModel, light_solver: LightSolver) -> None:

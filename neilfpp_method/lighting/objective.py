@@ -62,7 +62,7 @@ determine how the tint is shared between light and surfaces.
 """
 LINEAR_SHARE = 0.02
 """Share of all light below which the sparsity prior of a lamp is about linear; above, it is logarithmic."""
-NEIGHBOURS = 4
+NEIGHBORS = 4
 """Number of neighbouring points with which the base colour of a point is compared."""
 DARK_FLOOR = 0.02
 """Base colours are raised to at least this value before their logarithms are compared."""
@@ -187,9 +187,9 @@ def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:
 
 
 def nearest_points(position: Float[Tensor, "N 3"]) -> Int[Tensor, "N K"]:
-    """Indices of the `NEIGHBOURS` nearest other points of each point (of all others if there are fewer)."""
+    """Indices of the `NEIGHBORS` nearest other points of each point (of all others if there are fewer)."""
     distance = torch.cdist(position, position).fill_diagonal_(torch.inf)
-    return distance.topk(min(NEIGHBOURS, len(position) - 1), largest=False).indices
+    return distance.topk(min(NEIGHBORS, len(position) - 1), largest=False).indices
 
 
 def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) -> Float[Tensor, ""]:

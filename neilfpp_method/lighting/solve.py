@@ -128,5 +128,5 @@ def solve_light(
 
 def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
     """The fold of each point. Points with the same nearest random centre form a block of a fold."""
-    centres = torch.randperm(len(position), device=position.device)[: BLOCKS_OF_FOLD * FOLDS]
-    return torch.cdist(position, position[centres]).argmin(1) % FOLDS
+    centers = torch.randperm(len(position), device=position.device)[: BLOCKS_OF_FOLD * FOLDS]
+    return torch.cdist(position, position[centers]).argmin(1) % FOLDS

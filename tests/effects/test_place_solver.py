@@ -38,8 +38,8 @@ def test_neighbouring_points_of_the_same_side_are_a_place(small_memory):
     assert len(places.place.unique()) > COUNT // 4
     assert torch.bincount(places.place)[places.place].min() >= place_solver.MIN_PIXELS
     # A ball of radius 1 with 200 places: neighbours are about 0.1 apart.
-    centre = places.mean(places.observed.position)
-    assert (places.observed.position - centre[places.place]).norm(dim=-1).median() < 0.2
+    center = places.mean(places.observed.position)
+    assert (places.observed.position - center[places.place]).norm(dim=-1).median() < 0.2
 
 
 def test_an_empty_solver_has_no_places():
