@@ -81,6 +81,7 @@ def texel_centers(height: int, width: int, device: torch.device | str = "cpu") -
 
 
 @functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
 def cos_edges(
     height: int,
     device: torch.device | str = "cpu",
@@ -89,7 +90,8 @@ def cos_edges(
 ) -> Float[Tensor, " E"]:
     """Cosines of the polar angles that bound the rows of a map.
 
-    The result is kept, because training draws directions within texels in every step. Do not change it.
+    The result is kept, because training draws directions within texels in every step. Do not change it. It
+    is no inference tensor, so that later calls can be differentiated.
 
     Args:
         height: number of rows.

@@ -101,6 +101,7 @@ def radiance_times_cosine(share: Float[Tensor, "H W"], normal: Float[Tensor, "N 
 
 
 @functools.lru_cache(maxsize=8)
+@torch.inference_mode(False)
 def _cells(height: int, width: int, device: torch.device) -> _Cells:
     """Group the texels of a map of this size into cells of side × side texels."""
     side = math.ceil(height / CELL_ROWS)

@@ -111,3 +111,12 @@ def test_half_precision_normals(dtype):
     assert wi.dtype in (torch.float32, torch.float64)
     assert wi.isfinite().all()
     assert technique.pdf(wi).min() > 0
+
+
+def test_tensors_kept_between_calls_can_be_differentiated_after_inference_mode():
+    normal = torch.tensor([NORMALS[0]])
+    with torch.inference_mode():
+        radiance_times_cosine(shares(7, 11), normal).pdf(every_texel(7, 11))
+    share = shares(7, 11).requires_grad_()
+    assert radiance_times_cosine(share, normal).pdf(every_texel(7, 11)).isfinite().all()
+    assert not texel_solid_angles(7, 11).is_inference()
