@@ -72,6 +72,10 @@ MIN_LOSS = 0.005
 """Loss of the field below which its material is kept: that of relative errors of 3 %, which the steps of the
 grid cause as well.
 """
+MIN_METAL_ROUGHNESS = 0.2
+"""Metal that is smoother than this is kept: it mirrors more detail than a texel of the map and the grid of
+roughness resolve, so the search would underrate it.
+"""
 MIN_ROUGHNESS = 0.05
 """Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
 MIN_BASE_COLOR = 0.02
@@ -137,7 +141,8 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     best = best_materials(arriving, places, typical, METALLICS, near)
     found = on_grid(best.base_color, best.roughness, best.metallic)
     is_other = (current.metallic - found.metallic)[:, 0] >= MIN_CHANGE
-    is_better = is_other & (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
+    is_judged = (current.roughness[:, 0] >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
+    is_better = is_other & is_judged & (best.loss < MAX_RATIO * loss)
     material = _where(is_better[place], found[place], model.brdf(places.observed.position))
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
 

@@ -148,7 +148,7 @@ def view(content: dict) -> dict:
         (lambda c: c.update(views=[]), "no views"),
         (lambda c: c.update(views=3), "views: not a JSON list"),
         (lambda c: c["scene"].update(radius=0), "scene.radius: not positive"),
-        (lambda c: c["scene"].update(center=[1, 2]), "scene.centre: not 3 finite numbers"),
+        (lambda c: c["scene"].update(centre=[1, 2]), "scene.centre: not 3 finite numbers"),
         (lambda c: c.update(test=["999"]), "there is no view '999'"),
         (lambda c: c.update(test=[f"{i:03d}" for i in range(6)]), "all 6 views are held out"),
         (lambda c: c.update(point_cloud="gone.ply"), "point_cloud: there is no"),

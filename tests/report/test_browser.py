@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from neilfpp_method.report.write import ReportOptions, write_report
+from tests.calls import train_tiny
 from tests.data.make_capture import make_capture
 from tests.report.browser import BROWSER, after
-from tests.report.test_page import train
 
 pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")
 
@@ -24,7 +24,7 @@ CLICK = """
 def page(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     root = make_capture(folder / "ball", masks=True, test=(0, 2))
-    train(root, folder / "run", "--no-report")
+    train_tiny(root, folder / "run", "--no-report")
     return write_report(folder / "run", folder / "report.html", ReportOptions(views=2, size=24))
 
 
