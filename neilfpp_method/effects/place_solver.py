@@ -72,14 +72,16 @@ class PlaceSolver(nn.Module):
 
         This changes parameters, which is not allowed between the losses of a step and their gradients.
         """
-        if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
-            self._tried = True
-            self._start_light(model, light_solver)
-        if is_search_due(model, position) and position.step != self._searched:
-            self._searched = position.step
-            summary = improve_material(model, self.places())
-            if summary is not None:
-                self.say(summary)
+        # The fits need full precision, even within the autocast of the caller's loop.
+        with torch.autocast(self.points.rows.device.type, enabled=False):
+            if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
+                self._tried = True
+                self._start_light(model, light_solver)
+            if is_search_due(model, position) and position.step != self._searched:
+                self._searched = position.step
+                summary = improve_material(model, self.places())
+                if summary is not None:
+                    self.say(summary)
 
     @torch.no_grad()
     def places(self) -> Places:
