@@ -49,7 +49,6 @@ __all__ = [
 
 SEARCH_AT = (1 / 3, 2 / 3)
 """Shares of material init after which materials are searched."""
-
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
 pixels (measured on `spot_city`: 22 of 105 s).

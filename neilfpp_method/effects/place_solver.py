@@ -35,7 +35,7 @@ MIN_PIXELS = 4
 FOLDS = 20
 """Number of groups of points that stand for views when some are held back."""
 MAX_WAIT = 40
-"""Steps after which the light starts even if fewer points are remembered."""
+"""Steps after which the search for the initial light begins, even with fewer points."""
 
 
 class PlaceSolver(nn.Module):

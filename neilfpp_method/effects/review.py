@@ -156,10 +156,10 @@ def light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS
 
 
 def improve_material(model: NeilfModel, places: Places) -> str | None:
-    """Search for paint taken for metal, and train the BRDF field on them (`effects.material_search`).
+    """Search for paint taken for metal, and train the BRDF field on it (`effects.material_search`).
 
     Args:
-        model: see `material_search.can_search`.
+        model: its light is an environment map; see `material_search.is_search_due`.
         places: places in the training views, with linear radiance.
 
     Returns:
