@@ -1,10 +1,11 @@
-"""Three small captures with known effects of light, rendered by Mitsuba 3.
+"""Four small captures with known effects of light, rendered by Mitsuba 3.
 
     python -m benchmarks.effect_scenes build/effect-scenes --variant llvm_ad_rgb
 
     lambertian   a convex ball of eight Lambertian paints under a coloured sky with a sun
     lamp         a shiny ball and a dull box on a floor under an even white sky, with a white lamp
     bowl         a bowl with four coloured walls of equal roughness, under a grey sky with a bright window
+    polished     a vase of polished metals with a painted foot, under a sky with clouds and a sun
 
 Each is a folder in the layout of the published captures, with its mesh, depth, normals, and materials of the
 test views. A Lambertian surface has the roughness 1 there.
@@ -24,6 +25,7 @@ import trimesh
 import tyro
 from jaxtyping import Float
 from rich.console import Console
+from scipy import ndimage
 
 from benchmarks.mitsuba_scene import Lamp, Part, load_mitsuba, render
 from neilfpp_method.data.images import write_exr, write_png
@@ -97,7 +99,32 @@ def bowl() -> KnownScene:
     return KnownScene(parts, sky((0.7,) * 3, (0.15,) * 3, (25.0,) * 3), (), (65.0, 40.0))
 
 
-SCENES: Mapping[str, Callable[[], KnownScene]] = {"lambertian": lambertian, "lamp": lamp, "bowl": bowl}
+def polished() -> KnownScene:
+    """A vase with a waist, of three metals of roughness 0.15 to 0.3, on a foot of rough paint."""
+    height = np.linspace(-0.75, 0.75, 97)
+    waist = 0.33 - 0.16 * np.cos(2.4 * math.pi * (height + 0.75) / 1.5)
+    profile = np.concatenate([[[0, -0.75]], np.stack([waist, height], 1), [[0, 0.75]]])
+    vase = trimesh.creation.revolve(profile, sections=128)
+    level = np.digitize(vase.triangles_center[:, 2], (-0.45, -0.05, 0.35))
+    materials = [
+        ((0.6, 0.55, 0.45), 0.6, 0.0),
+        ((0.95, 0.75, 0.4), 0.15, 1.0),
+        ((0.9, 0.9, 0.9), 0.2, 1.0),
+        ((0.9, 0.6, 0.5), 0.3, 1.0),
+    ]
+    parts = [
+        Part(vase.submesh([np.nonzero(level == k)[0]], append=True), color, roughness, metallic)
+        for k, (color, roughness, metallic) in enumerate(materials)
+    ]
+    return KnownScene(parts, clouds(), (), (35.0, -5.0))
+
+
+SCENES: Mapping[str, Callable[[], KnownScene]] = {
+    "lambertian": lambertian,
+    "lamp": lamp,
+    "bowl": bowl,
+    "polished": polished,
+}
 
 
 def sky(
@@ -108,6 +135,18 @@ def sky(
     radiance = (1 - share) * np.array(above) + share * np.array(below) + np.zeros((height, 2 * height, 3))
     radiance[height // 4 - 1 : height // 4 + 2, height // 2 : height // 2 + 5] = sun
     return radiance
+
+
+def clouds(height: int = 64) -> Float[np.ndarray, "H W 3"]:
+    """A blue sky with a soft sun and white clouds over brown ground. Not random."""
+    noise = np.random.default_rng(0).normal(size=(height, 2 * height))
+    smooth = ndimage.gaussian_filter(noise, height / 12, mode=("nearest", "wrap"))
+    cover = np.clip(3 * smooth / smooth.std(), 0, 1)[..., None]
+    radiance = (1 - cover) * sky((0.4, 0.6, 1.0), (0.4, 0.5, 0.6), (0.4, 0.6, 1.0), height) + cover
+    radiance[height // 2 :] = 0.5 * radiance[height // 2 :] * np.array([0.6, 0.5, 0.35])
+    row, column = np.mgrid[:height, : 2 * height]
+    away = ((row - height // 4) ** 2 + (column - height // 2) ** 2) / (height / 16) ** 2
+    return radiance + np.exp(-away)[..., None] * np.array([30.0, 26.0, 20.0])
 
 
 def camera_at(azimuth: float, elevation: float, width: int, height: int) -> Camera:

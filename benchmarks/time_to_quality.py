@@ -35,7 +35,7 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
+from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates, waiting_fields
 from neilfpp_method.train.run import Run
 
 __all__ = ["Curve", "Mark", "curve", "table"]
@@ -133,7 +133,7 @@ def _training(
         if position.step == 0:
             model.train().freeze_for(position.stage)
         seed_step(config.train.seed, step)
-        set_rates(optimizer, config.optimizer, position)
+        set_rates(optimizer, config.optimizer, position, waiting_fields(model, config.optimizer, position))
         optimizer.zero_grad(set_to_none=True)
         computed = model.step(pixels.sample(config.train.rays), position.stage)
         weigh(

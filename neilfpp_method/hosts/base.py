@@ -32,6 +32,7 @@ __all__ = [
     "Regularised",
     "RegularisedHits",
     "SmoothsNormals",
+    "StartsFromShape",
     "TracesLight",
 ]
 
@@ -133,6 +134,17 @@ class LimitsSurfaceWidth(Protocol):
     def limit_surface_width(self, width: float) -> None:
         """Lower the width of the layer to `width` (scene units) if it is larger."""
         ...
+
+
+@runtime_checkable
+class StartsFromShape(Protocol):
+    """A host whose surface may have the outline of the object before training. R can then learn first.
+
+    Attributes:
+        starts_from_shape: whether the initial surface has been fitted to the object.
+    """
+
+    starts_from_shape: bool
 
 
 @runtime_checkable

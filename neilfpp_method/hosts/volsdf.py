@@ -71,6 +71,9 @@ class VolSdfHost(nn.Module):
         facts: the range and the initial value of R, and the background, which is not "auto" any more.
         points: oriented points on the surface, scene frame, for L_pcd.
         cameras: camera positions, scene frame; the space around them is empty (`volume.free_space`).
+
+    Attributes:
+        starts_from_shape: whether G has been fitted to a known shape (`train.start`); in checkpoints.
     """
 
     def __init__(
@@ -82,6 +85,7 @@ class VolSdfHost(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
+        self.starts_from_shape = False
         self.radiance_scale = facts.radiance_scale
         self.background_kind = facts.background
         # Buffers follow the host to its device. They are not in checkpoints, as the capture has them.
@@ -193,12 +197,12 @@ class VolSdfHost(nn.Module):
         return self.empty_space.may_hit(self.sdf, rays, interval, self.surface_width())
 
     def get_extra_state(self) -> dict[str, int | None]:
-        """The age of the distance grid, for checkpoints."""
-        return {"grid_age": self.grid_age}
+        """The age of the distance grid and the kind of start, for checkpoints."""
+        return {"grid_age": self.grid_age, "starts_from_shape": self.starts_from_shape}
 
     def set_extra_state(self, state: dict[str, int | None]) -> None:
         """Restore what `get_extra_state` returned."""
-        self.grid_age = state["grid_age"]
+        self.grid_age, self.starts_from_shape = state["grid_age"], state["starts_from_shape"]
 
     # ----------------------------------------------------------------------------------------------- geometry
 

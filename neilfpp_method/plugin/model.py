@@ -47,7 +47,7 @@ from neilfpp_method.shading.sampling import sample_directions
 from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
-from neilfpp_method.train.optimizer import adam, limit_surface_width, seed_step, set_rates
+from neilfpp_method.train.optimizer import adam, limit_surface_width, seed_step, set_rates, waiting_fields
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -202,9 +202,9 @@ class NeilfMethod(Model):
                 self._start_light(step)
             self.neilf.freeze_for(position.stage)
             self.set_up_for = position.stage
+        waiting = waiting_fields(self.neilf, self.rates, position)
         for optimizer in optimizers.optimizers.values():
-            far_points = self.neilf.facts.far_points
-            set_rates(optimizer, self.rates, position, background_waits=not far_points)
+            set_rates(optimizer, self.rates, position, waiting)
         seed_step(settings.seed, step)
 
     def _start_light(self, step: int) -> None:

@@ -40,6 +40,7 @@ from neilfpp_method.train.optimizer import (
     make_optimizer,
     seed_step,
     set_rates,
+    waiting_fields,
 )
 from neilfpp_method.train.quality import read_checks, write_checks
 from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
@@ -104,7 +105,8 @@ def _train_stage(
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
             at = StagePosition(stage, number, length)
-            set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
+            waiting = waiting_fields(run.model, run.config.optimizer, at)
+            set_rates(optimizer, run.config.optimizer, at, waiting)
             with timed("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
             moment = Moment.before_step(model, batch, at)

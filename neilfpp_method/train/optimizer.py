@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from neilfpp_method.hosts.base import Host, LimitsSurfaceWidth
+from neilfpp_method.hosts.base import Host, LimitsSurfaceWidth, StartsFromShape
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, rate_factor, surface_width_limit
 from neilfpp_method.settings.types import OptimizerConfig, VolumeConfig
 
-__all__ = ["adam", "gradient_norms", "limit_surface_width", "make_optimizer", "seed_step", "set_rates"]
+__all__ = [
+    "adam",
+    "gradient_norms",
+    "limit_surface_width",
+    "make_optimizer",
+    "seed_step",
+    "set_rates",
+    "waiting_fields",
+]
+
+GEOMETRY_FROM = 0.1
+"""Share of SDF init after which G and β are trained, if G starts from the visual hull."""
 
 
 def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Optimizer:
@@ -41,7 +52,7 @@ def set_rates(
     optimizer: torch.optim.Optimizer,
     config: OptimizerConfig,
     position: StagePosition,
-    background_waits: bool = True,
+    waiting: Collection[str] = (),
 ) -> None:
     """Set the learning rate of each field for a step of a stage.
 
@@ -49,16 +60,34 @@ def set_rates(
         optimizer: an optimizer with a group per field, as `make_optimizer` returns it.
         config: the learning rates and their schedule.
         position: the stage and the step within it.
-        background_waits: whether the background field stays fixed for the first part of SDF init
-            (`config.background_from`). Must be False if structure from motion has found points behind the
-            scene: a constant colour does not represent such a background, and training would explain it by
-            density within the scene instead.
+        waiting: fields that stay fixed in this step, see `waiting_fields`.
     """
     factor = rate_factor(config, position)
-    waits = background_waits and position.stage is Stage.SDF_INIT and position.share < config.background_from
     for group in optimizer.param_groups:
         name = group["name"]
-        group["lr"] = 0.0 if waits and name == "background" else getattr(config, name) * factor
+        group["lr"] = 0.0 if name in waiting else getattr(config, name) * factor
+
+
+def waiting_fields(model: NeilfModel, config: OptimizerConfig, position: StagePosition) -> set[str]:
+    """Name the fields that a step of SDF init does not train yet.
+
+    The background waits until surfaces exist (`config.background_from`), except if structure from motion has
+    found points behind the scene: a constant colour does not represent such a background, and training would
+    explain it by density within the scene instead.
+
+    Geometry waits for R (`GEOMETRY_FROM`) if it starts from the visual hull. While R does not yet vary with
+    direction, a mirror is best explained by a dent with the depth of what it reflects, and later training
+    does not remove such a dent.
+    """
+    if position.stage is not Stage.SDF_INIT:
+        return set()
+    waiting = set()
+    if position.share < config.background_from and not model.facts.far_points:
+        waiting.add("background")
+    starts_from_shape = isinstance(model.host, StartsFromShape) and model.host.starts_from_shape
+    if position.share < GEOMETRY_FROM and starts_from_shape:
+        waiting |= {"geometry", "beta"}
+    return waiting
 
 
 def limit_surface_width(host: Host, config: VolumeConfig, position: StagePosition) -> None:

@@ -64,7 +64,7 @@ __all__ = [
     "save_checkpoint",
 ]
 
-FORMAT = 2
+FORMAT = 3
 """Version of the layout of a run folder and of its checkpoints."""
 BESIDE_NERFSTUDIO = "neilfpp"
 """Name of the run folder that the plugin writes next to nerfstudio's `config.yml`."""

@@ -92,6 +92,7 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
     if isinstance(hull, str):
         return GeometryStart(reason=hull, warning=True)
     error = fit_distance(model.host.sdf_field, hull, config.volume.radius, config.train.seed, _rate(config))
+    model.host.starts_from_shape = True
     return GeometryStart(len(outlines), error)
 
 

@@ -18,7 +18,7 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.train.build import scene_facts
 from neilfpp_method.train.loop import train
-from neilfpp_method.train.optimizer import make_optimizer, set_rates
+from neilfpp_method.train.optimizer import make_optimizer, set_rates, waiting_fields
 from tests.data.make_capture import make_capture
 from tests.data.skies import GROUND, SKY, make_sky_capture
 from tests.scenes import sphere_model, tiny_config
@@ -50,7 +50,8 @@ def test_the_background_is_trained_after_surfaces_exist(stage, share, moves):
     model = sphere_model(background="inverted_sphere")
     config = OptimizerConfig(background_from=0.4)
     optimizer = make_optimizer(model, config)
-    set_rates(optimizer, config, StagePosition(stage, step=round(100 * share), length=100))
+    position = StagePosition(stage, step=round(100 * share), length=100)
+    set_rates(optimizer, config, position, waiting_fields(model, config, position))
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}
     assert (rates.pop("background") > 0) == moves
     assert all(rate > 0 for rate in rates.values())

@@ -16,11 +16,13 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.visual_hull import find_hull
+from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
 from neilfpp_method.train import command, start
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.optimizer import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import make_optimizer, seed_step, waiting_fields
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import save_checkpoint
 from neilfpp_method.train.start import GeometryStart, start_geometry
@@ -102,6 +104,23 @@ def test_the_start_depends_on_the_seed_and_keeps_the_random_state(masked):
     assert all(torch.equal(a, b) for a, b in zip(weights(first), weights(again), strict=True))
     started(masked, settings("sphere"))
     assert torch.equal(torch.get_rng_state(), state), "training draws the same whatever it started as"
+
+
+@pytest.mark.parametrize(("shape", "share", "waiting"), [
+    ("silhouettes", 0.0, {"geometry", "beta"}),
+    ("silhouettes", 0.09, {"geometry", "beta"}),
+    ("silhouettes", 0.1, set()),
+    ("sphere", 0.0, set()),
+])  # fmt: skip
+def test_geometry_waits_for_radiance_if_it_starts_from_the_hull(masked, shape, share, waiting):
+    model, _ = started(masked, settings(shape))
+    optimizer = model.config.optimizer
+    at = StagePosition(Stage.SDF_INIT, round(100 * share), 100)
+    assert waiting_fields(model, optimizer, at) - {"background"} == waiting
+    assert waiting_fields(model, optimizer, StagePosition(Stage.JOINT, 0, 100)) == set()
+    resumed = VolSdfHost(model.config, model.facts)
+    resumed.load_state_dict(model.host.state_dict())
+    assert resumed.starts_from_shape == (shape == "silhouettes"), "a resumed run must wait as well"
 
 
 def test_masks_of_test_views_are_not_used(masked):
