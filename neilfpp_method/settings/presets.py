@@ -131,7 +131,7 @@ FAST: Mapping[str, Any] = {
     "background.samples": 16,
     "volume.radius": 1.75,
     "volume.beta_init": 0.05,
-    "volume.beta_final": 0.005,
+    "volume.beta_final": 0.002,
     "volume.skip_empty": True,
     "volume.initial_samples": 64,
     "volume.rounds": 2,
@@ -169,7 +169,7 @@ FAST: Mapping[str, Any] = {
     "optimizer.background_from": 0.5,
     "train.sdf_steps": 2_000,
     "train.material_steps": 1_500,
-    "train.joint_steps": 100,
+    "train.joint_steps": 300,
     "train.rays": 512,
     "train.fresh": 0.25,
 }
