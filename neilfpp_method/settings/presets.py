@@ -136,7 +136,7 @@ FAST: Mapping[str, Any] = {
     "volume.initial_samples": 64,
     "volume.rounds": 2,
     "volume.samples": 32,
-    "volume.normal_radius": 0.15,
+    "volume.normal_radius": 0.08,
     "shading.lobe": "ggx",
     "shading.sampler": "mis",
     "shading.train_samples": 64,
