@@ -13,7 +13,7 @@ __all__ = ["MeshFit", "measure_mesh_fit"]
 
 PIXELS = 32_768
 """Number of training pixels, drawn evenly from all views, that are compared with the mesh."""
-MIN_SHOWN = 0.05
+MIN_SHOWN = 0.01
 """Smallest share of the pixels that must show the mesh if the capture has no masks."""
 MIN_OVERLAP = 0.8
 """Smallest overlap of the mesh with the masks. The true mesh of `spot_city` has 0.99; moved by a tenth of
@@ -37,16 +37,14 @@ class MeshFit:
     @property
     def warning(self) -> str | None:
         """One line for the console, with a remedy; None if nothing is wrong."""
-        if self.overlap is not None and self.overlap < MIN_OVERLAP:
-            what = f"the mesh covers the masks badly (intersection over union {self.overlap:.0%})"
-        elif self.shown < MIN_SHOWN:
+        if self.overlap is None:
             what = f"only {self.shown:.1%} of the training pixels show the mesh"
+            fits = self.shown >= MIN_SHOWN
         else:
-            return None
-        return (
-            f"{what}: give it in the world frame and the unit of length of the capture, complete, and check "
-            "the masks"
-        )
+            what = f"the mesh covers the masks badly (intersection over union {self.overlap:.0%})"
+            fits = self.overlap >= MIN_OVERLAP
+        remedy = "give it in the world frame and the unit of length of the capture, and check the masks"
+        return None if fits else f"warning: {what}; {remedy}"
 
 
 def measure_mesh_fit(host: MeshHost, pixels: PixelDataset) -> MeshFit:
