@@ -170,6 +170,14 @@ def _rgb(samples: Shaped[np.ndarray, "H W ..."] | None) -> Shaped[np.ndarray, "H
     return samples[..., [2, 1, 0, 3][: samples.shape[2]]]
 
 
+def _png_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    with Image.open(path) as image:
+        if "transparency" in image.info and image.mode in ("P", "L", "1"):
+            # OpenCV ignores the transparent colors of palettes and of grey images.
+            return np.asarray(image.convert("RGBA"))
+    return _opencv_samples(path)
+
+
 def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     with tifffile.TiffFile(path) as file:
         page = _tiff_page(file)
@@ -222,7 +230,7 @@ FORMATS: Mapping[str, Format] = {
     ".hdr": Format(_radiance_header, _radiance_samples),
     ".tif": TIFF,
     ".tiff": TIFF,
-    ".png": Format(_pillow_header, _opencv_samples),
+    ".png": Format(_pillow_header, _png_samples),
     ".jpg": JPEG,
     ".jpeg": JPEG,
 }

@@ -265,6 +265,18 @@ def test_jpeg_keeps_the_stored_orientation(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("mode", ["P", "L", "RGB"])
+def test_the_transparent_colour_of_a_png_is_its_alpha(tmp_path: Path, mode: str) -> None:
+    """Tools that shrink files store cut-out objects with a palette."""
+    picture = Image.fromarray(BYTES).convert(mode)
+    key = picture.getpixel((3, 2))
+    picture.save(tmp_path / "cut.png", transparency=key)
+    image = read_image(tmp_path / "cut.png")
+    expected = np.array([[picture.getpixel((x, y)) != key for x in range(WIDTH)] for y in range(HEIGHT)])
+    assert np.array_equal(image.alpha, expected)
+    assert np.allclose(image.pixels, np.asarray(picture.convert("RGB")) / 255, atol=1e-6)
+
+
 def test_written_png_is_rgb(tmp_path: Path) -> None:
     write_png(tmp_path / "new" / "a.png", BYTES)
     assert np.array_equal(np.asarray(Image.open(tmp_path / "new" / "a.png")), BYTES)
