@@ -34,6 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0 for success, 2 for bad input, 130 after Ctrl-C, 141 if standard output was closed,
         143 after SIGTERM, 1 otherwise.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # Names and signs that the encoding of the output lacks are printed as "?".
+            stream.reconfigure(errors="replace")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())

@@ -329,6 +329,29 @@ def test_a_function_may_return_a_dictionary():
         incomplete.losses(pixels(), Stage.MATERIAL_INIT)
 
 
+@pytest.mark.parametrize("miss", [torch.inf, torch.nan, 1e10])
+@pytest.mark.parametrize("names_opacity", [True, False])
+def test_the_depth_of_a_ray_that_misses_is_not_read(miss, names_opacity):
+    ball = Ball()
+
+    def dictionary(origins, directions):
+        color, position, normal = ball(origins, directions)
+        opacity = (normal.norm(dim=-1) > 0.5).float()
+        depth = torch.where(opacity > 0, (position - origins).norm(dim=-1), miss)
+        outputs = {"rgb": color, "depth": depth, "normal": normal}
+        return outputs | ({"accumulation": opacity[:, None]} if names_opacity else {})
+
+    batch = pixels(spread=1.5)
+    hits = CallableHost(dictionary).render(batch.rays)
+    missed = hits.opacity == 0
+    assert 0 < missed.sum() < len(missed)
+    torch.testing.assert_close(hits.position[missed], batch.rays.origins[missed])
+    loss = attach_neilf(dictionary, tiny_config()).losses(batch, Stage.JOINT).loss
+    loss.backward()
+    assert loss.isfinite()
+    assert all(p.grad.isfinite().all() for p in ball.parameters() if p.grad is not None)
+
+
 def test_a_color_without_gradient_is_accepted_if_it_is_not_trained():
     neilf = attach_neilf(spoiled(lambda c, p, n: (c.detach(), p, n)), tiny_config())
     assert neilf.losses(pixels(), Stage.MATERIAL_INIT).loss.isfinite()

@@ -166,6 +166,16 @@ def test_maps_of_an_image_are_hits_with_normals_from_depth():
     assert (angle < 15).float().mean() > 0.9
 
 
+def test_colors_in_half_precision_leave_positions_precise():
+    view = camera(24)
+    size, rays = (24, 24), camera_rays(view)
+    forward = torch.tensor(view.w2c[2, :3], dtype=torch.float32)
+    depth = torch.full(size, 2.0)
+    hits = image_hits(view, torch.ones(*size, 3).half(), depth, torch.ones(size).half())
+    position = rays.origins + (2.0 / (rays.directions @ forward))[:, None] * rays.directions
+    torch.testing.assert_close(hits.position, position, atol=1e-5, rtol=0)
+
+
 def test_a_material_is_learned_from_given_image_hits():
     torch.manual_seed(0)
     view, host = camera(), Splats()

@@ -84,7 +84,7 @@ def _listed_groups(folder: Path, unreadable: Collection[Path]) -> Mapping[str, S
         try:
             named = {
                 str(name): [folder / file for file in files]
-                for name, files in json.loads(path.read_text()).items()
+                for name, files in json.loads(path.read_text("utf-8-sig")).items()
             }
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(

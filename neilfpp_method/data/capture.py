@@ -273,7 +273,7 @@ def _named(views: tuple[View, ...], wanted: Collection[str | int], where: str) -
 
 def _read_split(path: Path) -> list[str | int]:
     try:
-        test = json.loads(path.read_text("utf-8"))["test"]
+        test = json.loads(path.read_text("utf-8-sig"))["test"]
     except (ValueError, OSError, RecursionError, KeyError, TypeError) as error:
         raise UserError(
             f"{path}: not a JSON object with the key 'test' ({error})", 'write {"test": [0, 8]}'

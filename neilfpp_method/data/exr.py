@@ -2,8 +2,7 @@
 
 Renderers store many layers in one file. The image is the first of these that exists: R, G, B in the part that
 is called Combined, rgba, rgb or beauty; R, G, B in any part; R, G, B of the only layer that has them, or of
-Blender's layer "Combined" if there are several; X, Y, Z; a single channel. The alpha channel of the same
-layer belongs to it.
+the only one with such a name; X, Y, Z; a single channel. The alpha channel of the same layer belongs to it.
 """
 
 from __future__ import annotations
@@ -25,10 +24,9 @@ __all__ = ["ExrHeader", "Window", "exr_header", "exr_samples"]
 COLORS, ALPHA = ("R", "G", "B"), "A"
 VECTOR = ("X", "Y", "Z")
 SINGLE = (("Y",), ("Z",))
-COMBINED = "Combined"
-MAIN_PARTS = ("combined", "rgba", "rgb", "beauty")
-"""Names of the part that is the image in Blender, Nuke and other renderers, in small letters; a layer may
-stand before it, as in "ViewLayer.Combined"."""
+MAIN = ("combined", "rgba", "rgb", "beauty")
+"""Names of the part or the layer that is the image in Blender, Nuke and other renderers, in small letters;
+others may stand before it, as in "ViewLayer.Combined"."""
 CHROMA = "RY"
 """Chroma channel of luminance/chroma images, stored at half the resolution. They are not supported."""
 
@@ -114,13 +112,13 @@ def _part_name(part: OpenEXR.Part) -> str:
 def _picture(
     path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]], part_names: Sequence[str]
 ) -> Picture:
-    layers = {f"{prefix}.": part for part, names in enumerate(parts) for prefix in _layers(names)}
-    combined = [layer for layer in layers if layer.split(".")[-2] == COMBINED]
-    (layer,) = combined if len(combined) == 1 else layers if len(layers) == 1 else ("",)
+    layers = {layer for names in parts for layer in _layers(names)}
+    main = [layer for layer in layers if _is_main(layer)]
+    (layer,) = main if len(main) == 1 else layers if len(layers) == 1 else ("",)
     alone = [(name,) for names in parts if len(rest := set(names) - {ALPHA}) == 1 for name in rest]
     for prefix, wanted in (
         ("", COLORS),
-        (layer, COLORS),
+        (f"{layer}.", COLORS),
         *(("", names) for names in (VECTOR, *SINGLE, *alone)),
     ):
         channels = tuple(prefix + name for name in wanted)
@@ -132,9 +130,9 @@ def _picture(
     raise UserError(f"{path}: no RGB or single channel among {listed}", "store the image as R, G, B")
 
 
-def _is_main(part: str) -> bool:
-    """Whether the name of a part says that it is the image and not one of its components."""
-    return part.rpartition(".")[2].lower() in MAIN_PARTS
+def _is_main(name: str) -> bool:
+    """Whether the name of a part or a layer says that it is the image and not one of its components."""
+    return name.rpartition(".")[2].lower() in MAIN
 
 
 def _layers(names: Sequence[str] | Mapping[str, object]) -> list[str]:

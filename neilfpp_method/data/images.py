@@ -99,8 +99,13 @@ def _pillow_header(path: Path) -> ImageHeader:
 
 def _tiff_header(path: Path) -> ImageHeader:
     with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
+        page = _tiff_page(file)
         return ImageHeader(page.imagewidth, page.imagelength, hdr=np.issubdtype(page.dtype, np.floating))
+
+
+def _tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
+    """The first page that is no reduced copy of another: a thumbnail may come before the image."""
+    return next((page for page in file.pages if not page.is_reduced), file.pages[0])
 
 
 def _radiance_lines(path: Path) -> list[bytes]:
@@ -112,32 +117,52 @@ def _radiance_lines(path: Path) -> list[bytes]:
     return lines[: lines.index(b"") + 2]
 
 
+def _radiance_axes(line: bytes) -> dict[bytes, int]:
+    """The axes of a file and their lengths, the slow one first: {b"-Y": 480, b"+X": 640} for `-Y 480 +X 640`.
+
+    Raises:
+        ValueError: the line is no size.
+    """
+    slow, rows, fast, columns = line.split()
+    if {slow[:1], fast[:1]} - {b"+", b"-"} or {slow[1:], fast[1:]} != {b"X", b"Y"}:
+        raise ValueError("its size is not of the form -Y 480 +X 640")
+    return {slow: int(rows), fast: int(columns)}
+
+
 def _radiance_header(path: Path) -> ImageHeader:
     lines = _radiance_lines(path)
-    y, height, x, width = lines[-1].split()
-    if (y, x) != (b"-Y", b"+X"):
-        raise ValueError("its rows are not stored from top to bottom")
     if b"FORMAT=32-bit_rle_xyze" in lines:
         raise ValueError("its colours are XYZ, not RGB")
-    return ImageHeader(int(width), int(height), hdr=True)
+    sizes = {axis[1:]: size for axis, size in _radiance_axes(lines[-1]).items()}
+    return ImageHeader(sizes[b"X"], sizes[b"Y"], hdr=True)
 
 
 def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     """Radiance: stored values are multiplied by every EXPOSURE of the header, and their channels by every
-    COLORCORR. OpenCV undoes neither.
+    COLORCORR, and rows may be stored in any order. OpenCV undoes none of this.
     """
+    lines = _radiance_lines(path)
     factors = np.ones(3)
-    for line in _radiance_lines(path):
+    for line in lines:
         if line.startswith((b"EXPOSURE=", b"COLORCORR=")):
             factors *= [float(word) for word in line.split(b"=")[1].split()]
     if not (np.isfinite(factors).all() and (factors > 0).all()):
         raise ValueError(f"an exposure or a color correction of {factors.min():g}")
-    return _opencv_samples(path) / factors.astype(np.float32)
+    axes = _radiance_axes(lines[-1])
+    pixels = path.read_bytes()[len(b"\n".join(lines)) :]
+    upright = b"\n".join([*lines[:-1], b"-Y %d +X %d" % tuple(axes.values())]) + pixels
+    samples = _rgb(cv2.imdecode(np.frombuffer(upright, np.uint8), cv2.IMREAD_UNCHANGED))
+    samples = samples if next(iter(axes)).endswith(b"Y") else samples.swapaxes(0, 1)
+    return samples[:: -1 if b"+Y" in axes else 1, :: -1 if b"-X" in axes else 1] / factors.astype(np.float32)
 
 
 def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     # IMREAD_UNCHANGED also ignores the EXIF orientation.
-    samples = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return _rgb(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+
+
+def _rgb(samples: Shaped[np.ndarray, "H W ..."] | None) -> Shaped[np.ndarray, "H W C"]:
+    """What OpenCV decoded, with the channels in the order of this module."""
     if samples is None:
         raise ValueError("damaged, or of a kind that OpenCV does not know")
     if samples.ndim == 2:
@@ -145,9 +170,17 @@ def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     return samples[..., [2, 1, 0, 3][: samples.shape[2]]]
 
 
+def _png_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    with Image.open(path) as image:
+        if "transparency" in image.info and image.mode in ("P", "L", "1"):
+            # OpenCV ignores the transparent colors of palettes and of grey images.
+            return np.asarray(image.convert("RGBA"))
+    return _opencv_samples(path)
+
+
 def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     with tifffile.TiffFile(path) as file:
-        page = file.pages[0]
+        page = _tiff_page(file)
         if page.photometric.name not in TIFF_COLORS:
             raise ValueError(f"its colours are {page.photometric.name}, not RGB")
         is_plain = page.compression.name in TIFF_UNPACKED and page.predictor in TIFF_PREDICTORS
@@ -160,7 +193,8 @@ def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
             return _colors_and_alpha(samples, 3 if page.photometric.name == "RGB" else 1, page.extrasamples)
         if ALPHA_APART in page.extrasamples and page.dtype == np.uint8:
             raise ValueError(f"{page.compression.name} compression with an alpha that is not associated")
-    return _opencv_samples(path)
+        _, samples = cv2.imreadmulti(str(path), page.index, 1, flags=cv2.IMREAD_UNCHANGED)
+    return _rgb(samples[0] if samples else None)
 
 
 def _colors_and_alpha(
@@ -196,7 +230,7 @@ FORMATS: Mapping[str, Format] = {
     ".hdr": Format(_radiance_header, _radiance_samples),
     ".tif": TIFF,
     ".tiff": TIFF,
-    ".png": Format(_pillow_header, _opencv_samples),
+    ".png": Format(_pillow_header, _png_samples),
     ".jpg": JPEG,
     ".jpeg": JPEG,
 }

@@ -81,7 +81,7 @@ def read_exposures(path: Path) -> Mapping[str, float]:
         UserError: the file is malformed, or an exposure is not a positive number.
     """
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
         if path.suffix.lower() == ".json":
             pairs = list(json.loads(text).items())
         else:

@@ -111,7 +111,8 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
     The centre is the point that most cameras look at, or else the least-squares point of all optical axes.
 
     Raises:
-        UserError: the axes are parallel or meet behind the cameras, or the cameras are at one point.
+        UserError: the axes are parallel, most cameras do not show the point where they meet, or the cameras
+            are at one point.
     """
     where = views[0].image.parent
     axes, focus = axes_of(views), find_focus(views)
@@ -128,12 +129,14 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
             "take photographs from several sides, or add a scene box",
         )
     depth = np.einsum("ni,ni->n", center - axes.eyes, axes.ahead)
-    if np.median(depth) <= 0:
+    beside = np.linalg.norm(np.einsum("nij,nj->ni", axes.across, center - axes.eyes), axis=1)
+    half = np.array([min(c.width / c.fx, c.height / c.fy) / 2 for c in (view.camera for view in views)])
+    if (beside < half * depth).mean() <= 0.5:
         raise UserError(
-            f"{where}: the cameras look away from one another, so the position of the scene is unknown",
-            "add points or a scene box",
+            f"{where}: the cameras look away from one another, as on a tripod that turns, so the position of "
+            "the scene is unknown",
+            "take photographs from several sides of the object, or add points or a scene box",
         )
-    half = [min(c.width / c.fx, c.height / c.fy) / 2 for c in (view.camera for view in views)]
     radius = float(np.median(depth * half)) * fill
     return Normalisation(radius, (float(center[0]), float(center[1]), float(center[2])))
 

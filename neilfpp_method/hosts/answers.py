@@ -14,6 +14,8 @@
 | normal        | `normal`, `normals`: vectors of any length                                        |
 | opacity       | `opacity`, `accumulation`, `alpha`, (N,) or (N, 1); else 1 if the normal is not 0 |
 | concentration | `concentration`; else the opacity                                                 |
+
+A ray without opacity misses, so its position is not read: many hosts return an infinite depth there.
 """
 
 from __future__ import annotations
@@ -109,6 +111,8 @@ def _from_dictionary(name: str, rays: RayBatch, outputs: Mapping[str, Tensor]) -
         position = rays.origins + depth[:, None] * rays.directions
     opacity = _optional(outputs, OPACITY)
     opacity = normal.detach().norm(dim=-1) if opacity is None else _column(name, "opacity", rays, opacity)
+    check_tensors(name, rays, {"position": position})
+    position = torch.where(opacity.detach()[:, None] > 0, position, rays.origins.to(position.dtype))
     concentration = _optional(outputs, CONCENTRATION)
     known = opacity.detach() if concentration is None else _column(name, "concentration", rays, concentration)
     return SurfaceHits(color, position, normal, opacity, known)

@@ -67,8 +67,9 @@ def image_hits(
             raise UserError(
                 f"the {name} of an image has the shape {shape}", f"give {wanted}, the size of the camera"
             )
-    rays = rays_like(camera, color)
-    axis = torch.as_tensor(camera.w2c[2, :3], dtype=color.dtype, device=color.device)
+    # Colours may be in half precision, which is too coarse for positions.
+    rays = rays_like(camera, depth)
+    axis = torch.as_tensor(camera.w2c[2, :3], dtype=depth.dtype, device=depth.device)
     distance = depth.reshape(-1) if along_ray else depth.reshape(-1) / (rays.directions @ axis)
     position = rays.origins + distance[:, None] * rays.directions
     if normal is None:

@@ -43,9 +43,11 @@ INVALID_VIEW = 0.5
 """Share of invalid pixels above which a view is reported."""
 MIN_COUNT, ADVISED_COUNT = 3, 16
 """Fewer views than the first are a problem, fewer than the second a warning."""
-BASELINE = 1e-3
-"""Extent of the camera centres below which all cameras are at one point, in scene units: views then have no
-parallax of a pixel."""
+BASELINE = 0.02
+"""Extent of the camera centres below which all cameras are at one place, as a share of their median distance
+from the centre or, if they are within the unit sphere, in scene units. The object then moves by about 20
+pixels between views of 1000 pixels.
+"""
 SPARSE_GAP = 25.0
 """Median angle to the nearest view, degrees, above which views are sparse."""
 MIN_COVERAGE = 0.25
@@ -252,8 +254,9 @@ def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Findin
         severity: Severity = "problem" if count < MIN_COUNT else "warning"
         remedy = f"take {ADVISED_COUNT} or more, better 50, from all around"
         yield Finding("few_views", severity, f"{count} view{'s' * (count != 1)}", remedy)
-    if count > 1 and np.ptp(placement.centers, axis=0).max() < BASELINE:
-        text = "all cameras are at one point, so the images do not determine the geometry"
+    distance = max(1.0, float(np.median(np.linalg.norm(placement.centers, axis=1))))
+    if count > 1 and np.ptp(placement.centers, axis=0).max() < BASELINE * distance:
+        text = "all cameras are at one place, so the images hardly determine the geometry"
         yield Finding("one_place", "problem", text, "take photographs from several sides")
     if count >= MIN_COUNT and placement.coverage < MIN_COVERAGE:
         text = f"the views cover {100 * placement.coverage:.0f} % of the directions around the object"

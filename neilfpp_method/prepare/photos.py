@@ -28,6 +28,12 @@ EXIF_FOLDER, MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x011
 """EXIF tags: the sub-directory of exposure data, manufacturer, model, orientation, focal length in
 millimetres, and the equivalent focal length on 35 mm film."""
 
+OTHER_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".webp", ".bmp")
+"""Suffixes of photographs in formats that are not read. They count as unreadable instead of being skipped."""
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+"""Suffixes of videos, which are skipped."""
+
 FILM_WIDTH = 36.0
 """Longer side of a frame of 35 mm film, in millimetres."""
 
@@ -118,7 +124,10 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
         message = f"{root}: {len(is_linear) or 'no'} image{'s' * (len(is_linear) != 1)}"
         if problems:
             message += f", and {len(problems)} that cannot be read ({next(iter(problems.values()))})"
-        raise UserError(message, f"give at least {MIN_PHOTOS}, better 30, from all around the object")
+        video = next((path for path in root.rglob("*") if path.suffix.lower() in VIDEO_SUFFIXES), None)
+        frames = f", for example frames of {video.name} (ffmpeg -i VIDEO -r 2 %04d.png)" if video else ""
+        wanted = f"give at least {MIN_PHOTOS}, better 30, from all around the object"
+        raise UserError(message, wanted + frames)
     if response == "auto" and len(set(is_linear.values())) > 1:
         hdr, ldr = (next(path for path in is_linear if is_linear[path] is kind) for kind in (True, False))
         raise UserError(f"{hdr} is linear and {ldr} is not", "keep images of one kind, or give --response")
@@ -154,7 +163,8 @@ def read_photo(path: Path) -> Picture:
 
 def _is_photo(path: Path, root: Path) -> bool:
     hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
-    return not hidden and path.suffix.lower() in IMAGE_SUFFIXES + RAW_SUFFIXES and path.is_file()
+    suffixes = (*IMAGE_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
+    return not hidden and path.suffix.lower() in suffixes and path.is_file()
 
 
 def check_names(names: Sequence[str], paths: Sequence[Path]) -> None:

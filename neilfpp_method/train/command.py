@@ -22,6 +22,7 @@ from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
+from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
@@ -39,6 +40,7 @@ from neilfpp_method.train.light_record import light_summary
 from neilfpp_method.train.lock import run_lock
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
+from neilfpp_method.train.mesh_fit import measure_mesh_fit
 from neilfpp_method.train.opening import OpenRun, open_run, plan_run, training_rays
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.pace import Pace
@@ -140,7 +142,7 @@ def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
         _create(run, facts)
     console.print(run.capture.summary, soft_wrap=True)
     if run.is_new and fabric.is_global_zero:
-        _describe_new(run, config, pixels, fabric.world_size, console)
+        _describe_new(run, model, pixels, fabric.world_size, console)
     console.print(f"run folder {run.out}", soft_wrap=True)
     # Every process computes the same initial geometry.
     start = start_geometry(model, run.capture, config) if untrained else None
@@ -177,15 +179,17 @@ def _create(run: OpenRun, facts: SceneFacts) -> None:
 
 
 def _describe_new(
-    run: OpenRun, config: NeilfConfig, pixels: PixelDataset, processes: int, console: Console
+    run: OpenRun, model: NeilfModel, pixels: PixelDataset, processes: int, console: Console
 ) -> None:
-    """Print problems of the poses, and how images, point cloud and exposures are used."""
+    """Print problems of the poses and of a given mesh, and how images, point cloud and exposures are used."""
     for line in problems_of_poses(run.capture):
         console.print(line, style="yellow", soft_wrap=True, markup=False)
+    if isinstance(model.host, MeshHost) and (warning := measure_mesh_fit(model.host, pixels).warning):
+        console.print(warning, style="yellow", soft_wrap=True)
     if run.source.scale < 1:
         rays = training_rays(run.plan.config.train, processes)
         console.print(_scale_summary(run.source.scale, len(pixels), rays), soft_wrap=True)
-    for line in (cloud_summary(run.capture, config), _exposures_summary(run.plan)):
+    for line in (cloud_summary(run.capture, model.config), _exposures_summary(run.plan)):
         if line is not None:
             console.print(line, soft_wrap=True)
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
 import pytest
 
 from tests.calls import refused
+from tests.data.make_capture import make_capture
 
 
 @pytest.mark.parametrize(
@@ -73,6 +75,23 @@ def test_settings_that_cannot_be(tmp_path, monkeypatch, capture, capfd, options,
     monkeypatch.chdir(tmp_path)
     command = ["train", "--data", capture, "--preset", "tiny", "--device", "cpu", *options]
     refused(capfd, command, *words, leaves=tmp_path)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_an_output_of_another_encoding(tmp_path, encoding):
+    """As of a terminal in another language, or of a file on Windows: they lack ×, −, and letters of names."""
+    root = make_capture(tmp_path / "Größe 写真")
+    command = [sys.executable, "-m", "neilfpp_method.cli", "inspect", str(root)]
+    process = subprocess.run(
+        command,
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": encoding},
+        timeout=60,
+        check=False,
+    )
+    assert process.returncode == 0
+    assert b"24" + "×".encode(encoding, "replace") + b"18" in process.stdout
+    assert process.stderr == b""
 
 
 def test_a_real_process_says_one_line_and_no_more(tmp_path):

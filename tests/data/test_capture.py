@@ -131,7 +131,7 @@ def test_split(tmp_path: Path) -> None:
     assert held_out(test_every=5) == ["004", "009", "014"]
     assert held_out(test_every=0) == []
     assert held_out(test_every=5, test=[3, "016"]) == ["003", "016"]
-    (tmp_path / "split.json").write_text('{"test": ["002", 11]}')
+    (tmp_path / "split.json").write_text('\ufeff{"test": ["002", 11]}', "utf-8")
     assert held_out() == ["002", "011"]
     (tmp_path / "split.json").unlink()
     assert held_out() == ["007", "015"]

@@ -36,6 +36,7 @@ def written(path: Path, *parts: dict[str, np.ndarray]) -> Path:
     [
         [{**BEAUTY, **DATA}],
         [{**DATA, **DIFFUSE, **BEAUTY}],
+        [{**planes("beauty.", RGB), **planes("albedo.", OTHER), **planes("specular.", OTHER)}],
         [{**planes("diffuse.", OTHER), **planes("specular.", OTHER), **planes("", RGB)}],
         [planes("", OTHER, "XYZ"), planes("", RGB)],
         [{"Z": OTHER[..., 0].copy()}, planes("", RGB), planes("", OTHER)],
@@ -44,6 +45,7 @@ def written(path: Path, *parts: dict[str, np.ndarray]) -> Path:
     ids=[
         "one layer",
         "Combined",
+        "beauty",
         "unnamed layer",
         "colours before vectors",
         "first part with colours",

@@ -155,6 +155,29 @@ def test_radiance_hdr_by_the_definition_of_rgbe(tmp_path: Path) -> None:
     assert np.allclose(read_image(tmp_path / "a.hdr").pixels, expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("slow", ["-Y", "+Y", "-X", "+X"])
+@pytest.mark.parametrize("packed", [True, False])
+@pytest.mark.parametrize("fast_sign", ["+", "-"])
+def test_radiance_rows_in_any_order(tmp_path: Path, slow: str, fast_sign: str, packed: bool) -> None:
+    path, picture = tmp_path / "a.hdr", np.random.default_rng(6).uniform(0.5, 1, (20, 30, 3))
+    fast = fast_sign + ("X" if slow[1] == "Y" else "Y")
+    stored = picture[:: 1 if "-Y" in (slow, fast) else -1, :: 1 if "+X" in (slow, fast) else -1]
+    stored = stored if slow[1] == "Y" else stored.transpose(1, 0, 2)
+    rows, columns = stored.shape[:2]
+    cv2.imwrite(str(path), stored[..., ::-1].astype(np.float32), [cv2.IMWRITE_HDR_COMPRESSION, int(packed)])
+    size = f"{slow} {rows} {fast} {columns}".encode()
+    path.write_bytes(path.read_bytes().replace(b"-Y %d +X %d" % (rows, columns), size, 1))
+    assert (image_header(path).width, image_header(path).height) == (30, 20)
+    assert np.allclose(read_image(path).pixels, picture, atol=1 / 128)
+
+
+@pytest.mark.parametrize("size", [b"-Y 5 +Y 7", b"Y 5 X 7", b"5 7 + -"])
+def test_a_radiance_file_without_a_size_is_refused(tmp_path: Path, size: bytes) -> None:
+    (tmp_path / "a.hdr").write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + size + b"\n" + bytes(140))
+    with pytest.raises(UserError, match="not of the form -Y 480"):
+        read_image(tmp_path / "a.hdr")
+
+
 @pytest.mark.parametrize("mode", ["L", "LA", "P", "1"])
 def test_png_kinds(tmp_path: Path, mode: str) -> None:
     Image.fromarray(BYTES).convert(mode).save(tmp_path / "kind.png")
@@ -214,6 +237,22 @@ def test_a_tiff_with_an_orientation_or_further_channels_is_read_as_stored(tmp_pa
     assert image.alpha is None
 
 
+@pytest.mark.parametrize("compression", [None, "lzw"])
+def test_the_thumbnail_of_a_tiff_is_not_the_image(tmp_path: Path, compression: str | None) -> None:
+    small, large = (np.asarray(Image.fromarray(BYTES).resize(size)) for size in ((3, 2), (WIDTH, HEIGHT)))
+    with tifffile.TiffWriter(tmp_path / "plain.tif") as file:
+        file.write(small, photometric="rgb", subfiletype=1)
+        file.write(large, photometric="rgb")
+    # Pillow writes the compression that OpenCV decodes, but not the tag of a reduced page by itself.
+    pages = [Image.fromarray(page) for page in (small, large)]
+    pages[0].encoderinfo = {"tiffinfo": {254: 1}}
+    pages[0].save(tmp_path / "lzw.tif", compression="tiff_lzw", save_all=True, append_images=pages[1:])
+    path = tmp_path / f"{compression or 'plain'}.tif"
+    assert tifffile.TiffFile(path).pages[0].is_reduced
+    assert (image_header(path).width, image_header(path).height) == (WIDTH, HEIGHT)
+    assert np.allclose(read_image(path).pixels, BYTES / 255, atol=1e-6)
+
+
 def test_jpeg_keeps_the_stored_orientation(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6  # "rotate by 90° to show"
@@ -224,6 +263,18 @@ def test_jpeg_keeps_the_stored_orientation(tmp_path: Path) -> None:
         WIDTH,
         HEIGHT,
     )
+
+
+@pytest.mark.parametrize("mode", ["P", "L", "RGB"])
+def test_the_transparent_colour_of_a_png_is_its_alpha(tmp_path: Path, mode: str) -> None:
+    """Tools that shrink files store cut-out objects with a palette."""
+    picture = Image.fromarray(BYTES).convert(mode)
+    key = picture.getpixel((3, 2))
+    picture.save(tmp_path / "cut.png", transparency=key)
+    image = read_image(tmp_path / "cut.png")
+    expected = np.array([[picture.getpixel((x, y)) != key for x in range(WIDTH)] for y in range(HEIGHT)])
+    assert np.array_equal(image.alpha, expected)
+    assert np.allclose(image.pixels, np.asarray(picture.convert("RGB")) / 255, atol=1e-6)
 
 
 def test_written_png_is_rgb(tmp_path: Path) -> None:

@@ -97,19 +97,30 @@ def test_cameras_that_look_in_one_direction_or_apart_are_refused(tmp_path: Path)
         box_of_cameras(away)
 
 
-def test_cameras_at_one_point_are_refused(tmp_path: Path) -> None:
-    """Their axes meet at the cameras, up to rounding errors, and the box would have a size of 1e-15."""
-    several = views(tmp_path)
-    eye = np.array([5.2, -0.2, 0.3])
-    turned = []
-    for i, view in enumerate(several):
+def turned(several: tuple[View, ...], jitter: float = 0.0) -> list[View]:
+    """Views of a tripod that turns about its vertical axis and is moved by `jitter` between photographs."""
+    eyes = np.array([5.2, -0.2, 0.3]) + np.random.default_rng(1).normal(scale=jitter, size=(len(several), 3))
+    result = []
+    for i, (view, eye) in enumerate(zip(several, eyes, strict=True)):
         w2c = view.camera.w2c.copy()
         cos, sin = np.cos(0.1 * i), np.sin(0.1 * i)
         w2c[:3, :3] = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]) @ several[0].camera.w2c[:3, :3]
         w2c[:3, 3] = -w2c[:3, :3] @ eye
-        turned.append(replace(view, camera=replace(view.camera, w2c=w2c)))
+        result.append(replace(view, camera=replace(view.camera, w2c=w2c)))
+    return result
+
+
+def test_cameras_at_one_point_are_refused(tmp_path: Path) -> None:
+    """Their axes meet at the cameras, up to rounding errors, and the box would have a size of 1e-15."""
     with pytest.raises(UserError, match="all cameras are at one point"):
-        find_box(turned)
+        find_box(turned(views(tmp_path)))
+
+
+@pytest.mark.parametrize("count", [8, 12, 20, 31])
+def test_cameras_that_turn_at_one_place_are_refused(tmp_path: Path, count: int) -> None:
+    """Their axes meet within millimetres of them, before some and behind others."""
+    with pytest.raises(UserError, match="look away from one another, as on a tripod that turns"):
+        find_box(turned(views(tmp_path, count=count), jitter=0.003))
 
 
 def test_masks_without_a_common_region_are_refused(tmp_path: Path) -> None:

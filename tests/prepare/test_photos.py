@@ -55,6 +55,20 @@ def test_exif_gives_the_orientation_of_a_camera(tmp_path):
     assert [photo.orientation for photo in survey(tmp_path, "auto").items] == [1, 6, 8, 99]
 
 
+def test_photographs_in_other_formats_are_not_skipped(tmp_path):
+    for i in range(3):
+        exr(tmp_path / f"{i}.exr")
+    (tmp_path / "IMG_7.HEIC").write_bytes(b"")
+    (tmp_path / "IMG_7.MOV").write_bytes(b"")
+    problems = survey(tmp_path, "auto").unreadable
+    assert [path.name for path in problems] == ["IMG_7.HEIC"]
+    assert "not an image format that is read" in problems[tmp_path / "IMG_7.HEIC"]
+    for i in range(3):
+        (tmp_path / f"{i}.exr").unlink()
+    with pytest.raises(UserError, match=r"no images, and 1 that cannot be read .* frames of IMG_7\.MOV"):
+        survey(tmp_path, "auto")
+
+
 def test_unreadable_files_are_listed(tmp_path):
     for i in range(3):
         exr(tmp_path / f"{i}.exr")

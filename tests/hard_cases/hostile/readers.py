@@ -134,6 +134,8 @@ def _jpeg(folder: Path) -> list[Path]:
 def _hdr(folder: Path) -> list[Path]:
     cv2.imwrite(str(folder / "packed.hdr"), _picture(3))
     cv2.imwrite(str(folder / "plain.hdr"), _picture(3), [cv2.IMWRITE_HDR_COMPRESSION, 0])
+    upright = (folder / "packed.hdr").read_bytes()
+    (folder / "rotated.hdr").write_bytes(upright.replace(b"-Y", b"-X", 1).replace(b"+X", b"+Y", 1))
     return sorted(folder.iterdir())
 
 
