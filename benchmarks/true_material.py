@@ -66,7 +66,7 @@ def known_points(run: Run) -> Known:
     for known in known_test_views(run, rendered).views:
         if known.material is None:
             raise UserError(f"{run.capture.root}: no true materials", "take a capture with ground truth")
-        rays = camera_rays(run.capture.normalisation.camera(known.view.camera))
+        rays = camera_rays(run.capture.normalization.camera(known.view.camera))
         hits = run.model.host.render(rays)
         rows = torch.nonzero(
             hits.is_hit(run.config.shading.hit_share) & torch.from_numpy(known.mask.reshape(-1))
@@ -106,7 +106,7 @@ def line(run: Run, title: str) -> str:
     )
     lamps = run.model.lamps
     for k in range(lamps.count):
-        place = run.capture.normalisation.to_world(lamps.position[k]).tolist()
+        place = run.capture.normalization.to_world(lamps.position[k]).tolist()
         text += "\n" + 24 * " " + "lamp at " + ", ".join(f"{x:.2f}" for x in place)
         text += "; axis " + ", ".join(f"{x:.2f}" for x in lamps.axis[k].tolist())
         text += "; intensity " + ", ".join(f"{x:.2f}" for x in lamps.intensity[k].tolist())

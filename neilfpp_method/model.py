@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
-from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
+from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import (
     Sources,
@@ -199,9 +199,9 @@ class NeilfModel(nn.Module):
         with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
             if hits is not None:
                 hits, terms = hits if torch.is_grad_enabled() else hits.detach(), {}
-            elif isinstance(self.host, Regularised):
-                regularised = self.host.render_regularised(batch, active)
-                hits, terms = regularised.hits, dict(regularised.terms)
+            elif isinstance(self.host, Regularized):
+                regularized = self.host.render_regularized(batch, active)
+                hits, terms = regularized.hits, dict(regularized.terms)
             else:
                 hits, terms = self.host.render(batch.rays), {}
             self.check_outputs(batch.rays, hits, color_moves="volume" in active and torch.is_grad_enabled())

@@ -90,7 +90,7 @@ class PixelBatch(Indexable):
         mask_known: 1 everywhere if the capture has masks. Without masks it is 1 only at pixels that show
             exactly the background colour; all other pixels have `mask` 1.
         image_gradient: length of the gradient of the image's luminance by Scharr's filter without
-            normalisation, that is 32 times the change per pixel; 0 if no loss needs it.
+            normalization, that is 32 times the change per pixel; 0 if no loss needs it.
         view: index of the training view.
     """
 

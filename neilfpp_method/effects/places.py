@@ -84,7 +84,7 @@ def gather_places(
         normal: unit normals of the places.
         views: maximum number of randomly drawn views per place; it bounds time and memory.
     """
-    to_scene = pixels.capture.normalisation.camera
+    to_scene = pixels.capture.normalization.camera
     cameras = [to_scene(view.camera) for view in pixels.views]
     chosen = torch.rand(len(position), len(cameras), device=position.device).argsort(1).argsort(1) < views
     parts = []

@@ -203,7 +203,7 @@ def surface_at_pixels(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"
         pixels: row-major pixel indices.
     """
     camera = next(v.camera for v in run.capture.views if v.name == view.name)
-    rays = camera_rays(run.capture.normalisation.camera(camera))[torch.from_numpy(pixels)]
+    rays = camera_rays(run.capture.normalization.camera(camera))[torch.from_numpy(pixels)]
     depth = torch.from_numpy(view.maps["depth"].reshape(-1, 1)[pixels])
     normal = torch.from_numpy(view.maps["normal"].reshape(-1, 3)[pixels])
     points = OrientedPoints(rays.origins + depth * rays.directions, normal)

@@ -162,7 +162,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
         columns |= zip(("red", "green", "blue", "alpha"), (*color.T, opaque), strict=True)
         columns["roughness"] = material.roughness[:, 0].cpu().numpy()
         columns["metallic"] = material.metallic[:, 0].cpu().numpy()
-    mesh.vertices = run.capture.normalisation.to_world(position.double()).cpu().numpy()
+    mesh.vertices = run.capture.normalization.to_world(position.double()).cpu().numpy()
     write_ply(path, np.array(mesh.vertices), columns, np.array(mesh.faces))
     return mesh
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
-from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularisedHits, TracesLight
+from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
 from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -84,8 +84,8 @@ class ForeignHost(nn.Module):
                 object.__setattr__(self, capability, getattr(host, capability))
         if proxy is not None:
             object.__setattr__(self, "scene_light", proxy.scene_light)
-        if hasattr(host, "render_regularised"):
-            object.__setattr__(self, "render_regularised", self._render_regularised)
+        if hasattr(host, "render_regularized"):
+            object.__setattr__(self, "render_regularized", self._render_regularized)
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Hits by the host, or by the proxy if the host cannot render rays that start at a surface.
@@ -143,11 +143,11 @@ class ForeignHost(nn.Module):
             self.proxy.explore(self.render, rays, hits)
         self.proxy.observe(rays, hits)
 
-    def _render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+    def _render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         if len(batch) == 0:
-            return RegularisedHits(no_hits(batch.rays), {})
-        rendered = self.inner.render_regularised(batch, names)
-        return RegularisedHits(self.read(batch.rays, rendered.hits), rendered.terms)
+            return RegularizedHits(no_hits(batch.rays), {})
+        rendered = self.inner.render_regularized(batch, names)
+        return RegularizedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
     def _precise(self, rays: RayBatch, hits: SurfaceHits) -> SurfaceHits:
         if hits.position.dtype in COARSE and not self.warned_of_precision:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.sdf import SdfField, SdfSample
-from neilfpp_method.hosts.base import RegularisedHits
+from neilfpp_method.hosts.base import RegularizedHits
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.facts import SceneFacts
@@ -120,7 +120,7 @@ class VolSdfHost(nn.Module):
             return self._march(rays).hits
         return self._render_visible_parts(rays)
 
-    def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+    def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         """As `render`, with those of the losses eikonal, hessian, surface, point_cloud and mask in
         `names`.
         """
@@ -130,7 +130,7 @@ class VolSdfHost(nn.Module):
                 self.grid_age += 1
             if self.empty_space is not None:
                 self.empty_space.moved()
-        return RegularisedHits(march.hits, self._regularisers(march, batch, names))
+        return RegularizedHits(march.hits, self._regularizers(march, batch, names))
 
     def surface_width(self) -> Float[Tensor, ""]:
         """β, the scale of the Laplace density, without gradient."""
@@ -324,7 +324,7 @@ class VolSdfHost(nn.Module):
     # ------------------------------------------------------------------------------------------- regularisers
 
     @timed("regularisers")
-    def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
+    def _regularizers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
         places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None
         if "eikonal" in names:

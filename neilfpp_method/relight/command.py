@@ -115,7 +115,7 @@ def relight(
     shots = _shots(request, run)
     lights = _lights(request, run, say)
     lamps = _lamps(request, run)
-    box = None if request.box is None else scene_box(request.box, run.capture.normalisation)
+    box = None if request.box is None else scene_box(request.box, run.capture.normalization)
     stencils = read_stencils(request.mask, run.capture)
     folders = {name: PictureFolder(out / name, _settings(request, run, name)) for name in lights}
     truths = [find_truth(folder, [shot.view for shot in shots]) for folder in request.truth]
@@ -257,7 +257,7 @@ def _lamps(request: Request, run: Run) -> Lamplight | None:
     if not _with_lamps(request):
         return None
     edits = parse_lamp_edits(request.lamp_edits)
-    return edited_lamps(lamps_of_run(run.model.lamps), edits, run.capture.normalisation)
+    return edited_lamps(lamps_of_run(run.model.lamps), edits, run.capture.normalization)
 
 
 # -------------------------------------------------------------------------------------------------- rendering

@@ -30,7 +30,14 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger, recording
 from neilfpp_method.train.budget_record import write_budget
 from neilfpp_method.train.budgeted import close_budget, outcome
-from neilfpp_method.train.build import build_model, cloud_summary, exposures_of, initial_model, scene_facts
+from neilfpp_method.train.build import (
+    build_model,
+    cloud_summary,
+    exposures_at_cloud,
+    initial_model,
+    scene_facts,
+)
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.effects_record import write_plan
 from neilfpp_method.train.health_record import health_summary
@@ -47,7 +54,7 @@ from neilfpp_method.train.progress import Reporter, reporting
 from neilfpp_method.train.quality import Quality, has_checks
 from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import PIXELS, create_run, last_checkpoint
+from neilfpp_method.train.run import PIXELS, create_run
 from neilfpp_method.train.start import start_geometry
 from neilfpp_method.train.stopping import continue_command, stop_request
 from neilfpp_method.train.training import Training
@@ -161,7 +168,7 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
     """
     if not plan.is_on("exposure"):
         return None
-    exposures = exposures_of(capture, pixels)
+    exposures = exposures_at_cloud(capture, pixels)
     record_exposures(plan, exposures)
     if not plan.is_on("exposure"):
         return None

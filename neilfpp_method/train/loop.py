@@ -10,7 +10,7 @@ import dataclasses
 import math
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -30,9 +30,18 @@ from neilfpp_method.schedule import (
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.timing.ledger import timed
+from neilfpp_method.train.checkpoint import (
+    LAST,
+    checkpoint_path,
+    last_checkpoint,
+    load_checkpoint,
+    load_weights,
+    save_checkpoint,
+)
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.evidence import apply_plan, review_before_stage, search_material, solve_light
 from neilfpp_method.train.health_record import read_findings, write_findings
+from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.light_record import read_fits, write_fits
 from neilfpp_method.train.optimizer import (
     gradient_norms,
@@ -42,7 +51,6 @@ from neilfpp_method.train.optimizer import (
     set_rates,
 )
 from neilfpp_method.train.quality import read_checks, write_checks
-from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.training import Training
 from neilfpp_method.train.work_record import write_work
@@ -77,7 +85,7 @@ def train(run: Training) -> None:
         if step < total_steps(run.config.train):
             with timed("checks", apart=True):
                 review_before_stage(run, model, step)
-        _save(run, optimizer, step, also=position.stage.value)
+        _save(run, optimizer, step, names=(position.stage.value, LAST))
         with timed("checks", apart=True):
             model.eval()
             run.preview(model, position.stage)
@@ -198,7 +206,7 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, st
     if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
             f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
-            f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
+            f"the last good checkpoint is kept in {last_checkpoint(run.path).parent}; look at the capture's "
             "brightest pixels or lower the learning rates",
         )
 
@@ -230,7 +238,8 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 
 
 @timed("saving", apart=True)
-def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
+def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, names: Sequence[str] = (LAST,)) -> None:
+    """Write the records of the run, and its state as checkpoints of these names."""
     if run.fabric.is_global_zero:
         try:
             # The records are written before the checkpoint: when the run is resumed, entries after the
@@ -241,10 +250,8 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_checks(run.path, run.quality)
             if run.pace is not None:
                 run.pace.save(run.path, run.config.train)
-            for name in filter(None, (also, "last")):
-                save_checkpoint(
-                    run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step
-                )
+            for name in names:
+                save_checkpoint(checkpoint_path(run.path, name), run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
             write_work(run.path, run.ledger)
         except UserError as error:
@@ -253,7 +260,7 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
 
 
 def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
-    path = run.path / "checkpoints" / "last.pt"
+    path = last_checkpoint(run.path)
     if not path.exists():
         return 0
     saved = load_checkpoint(path)

@@ -12,6 +12,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
 from neilfpp_method.relight.sky import Sky
+from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.address import check_free, is_local
@@ -113,7 +114,7 @@ def _load(request: Request) -> Subject:
 
 def _checkpoint_time(request: Request) -> int | None:
     """Time at which the checkpoint was written, ns; None if there is no checkpoint."""
-    path = request.run / "checkpoints" / f"{request.checkpoint}.pt"
+    path = checkpoint_path(request.run, request.checkpoint)
     return path.stat().st_mtime_ns if path.is_file() else None
 
 

@@ -86,7 +86,7 @@ def test_light_field(truth: Truth) -> None:
     np.savez(path, **light_field(points))
     field = truth.light_field()
     assert torch.allclose(
-        truth.capture.normalisation.to_world(field.position), torch.from_numpy(points), atol=1e-6
+        truth.capture.normalization.to_world(field.position), torch.from_numpy(points), atol=1e-6
     )
     assert field.incident.shape == (4, 5, 3)
     assert field.material.roughness.shape == (4, 1)

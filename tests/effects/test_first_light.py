@@ -116,11 +116,11 @@ def test_an_untrained_field_starts_at_the_estimated_material():
 def test_a_model_starts_with_the_estimated_map():
     model = sphere_model(preset("fast"))
     none = torch.zeros(0, 3)
-    grey = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))
+    gray = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))
     unseen = Observed(none, none, none, none), Material(none, none[:, :1], none[:, :1])
     places = ball(torch.ones(1, 3), torch.ones(1, 1), torch.zeros(1, 1), None)
     trial = LampTrial(*[places, place_transport(places, LOBES["ggx"], None)] * 2, 1.0, pytest.fail)
-    found = FirstLight(sky().log_radiance, grey, {0.33: 0.1}, 0.33, COUNT, *unseen, trial)
+    found = FirstLight(sky().log_radiance, gray, {0.33: 0.1}, 0.33, COUNT, *unseen, trial)
     start_with(model, found)
     coarse = model.light.at_most(ROWS).log_radiance
     assert (coarse - sky().log_radiance).abs().median() < 0.1

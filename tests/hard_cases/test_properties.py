@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from neilfpp_method.data.views import Camera, Normalisation, camera_rays, project
+from neilfpp_method.data.views import Camera, Normalization, camera_rays, project
 from neilfpp_method.fields.encodings import direction_encoding, position_encoding
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces
@@ -324,7 +324,7 @@ def test_rays_project_back_to_their_pixels(dtype, uv, log_scale, away, focal, ce
     middle = away * scale * np.array([0.6, 0.0, -0.8])
     w2c[:3, 3] = -w2c[:3, :3] @ (middle - 3.0 * scale * forward)
     camera = Camera(8 * focal, 8 * focal, *(8 * center), 8, 6, w2c)
-    scene = Normalisation(scale, tuple(middle)).camera(camera)
+    scene = Normalization(scale, tuple(middle)).camera(camera)
     rays = camera_rays(scene, dtype)
     assert_finite(rays.origins, bound=3.1)
     torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(48, dtype=dtype))

@@ -179,14 +179,14 @@ def test_scale(capture: Capture) -> None:
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 3))
     for size, severity in ((2.0, "problem"), (0.05, "warning")):
-        points = np.array(capture.normalisation.center) + capture.normalisation.scale * size * rng.uniform(
+        points = np.array(capture.normalization.center) + capture.normalization.scale * size * rng.uniform(
             -1, 1, (500, 3)
         )
         write_ply(capture.root / "cloud.ply", points, normal)
         findings = inspect_capture(replace(capture, point_cloud=capture.root / "cloud.ply")).findings
         assert [(finding.kind, finding.severity) for finding in findings] == [("scale", severity)]
-    closer = replace(capture.normalisation, scale=10 * capture.normalisation.scale)
-    kinds = found(replace(capture, normalisation=closer, point_cloud=None))
+    closer = replace(capture.normalization, scale=10 * capture.normalization.scale)
+    kinds = found(replace(capture, normalization=closer, point_cloud=None))
     assert len(kinds["camera_inside"]) == len(capture.views)
     assert "scale_guessed" in found(replace(capture, scene_from="cameras"))
 

@@ -244,7 +244,7 @@ def test_a_capture_with_poses_keeps_them(tmp_path):
     assert prepare(tmp_path / "sphere", tmp_path / "out") == 0
     capture = load_capture(tmp_path / "out")
     assert capture.format == "neilfpp"
-    assert capture.normalisation == source.normalisation
+    assert capture.normalization == source.normalization
     assert capture.test == source.test
     for view, old in zip(capture.views, source.views, strict=True):
         assert view.name == old.name
@@ -389,7 +389,7 @@ def test_the_ring_is_placed_exactly(tmp_path):
     poses = {name: np.array(camera["w2c"]) for name, camera in truth.items()}
     scale, _, _, centers, rotations = to_truth(capture, poses)
     assert len(capture.views) == 36
-    assert centers < 0.005 * scale * capture.normalisation.scale
+    assert centers < 0.005 * scale * capture.normalization.scale
     assert rotations < 0.2
     assert (
         main(

@@ -10,6 +10,7 @@ import pytest
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import write_exr
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.view import command
 from neilfpp_method.view.address import check_free
 
@@ -63,7 +64,7 @@ def test_following_waits_and_shows_each_new_checkpoint(found, port, tmp_path, mo
         if number == 0:
             shutil.copytree(found, run)
         if number == 2:
-            os.utime(run / "checkpoints" / "last.pt")
+            os.utime(last_checkpoint(run))
         return number == 3
 
     command.view(request(run, port, follow=True), said.append, turn)

@@ -109,7 +109,7 @@ def export_asset(
             cannot be written.
     """
     full = fine_surface(run, resolution)
-    cameras = [run.capture.normalisation.camera(view.camera) for view in run.capture.train_views]
+    cameras = [run.capture.normalization.camera(view.camera) for view in run.capture.train_views]
     fine = clean(full, visible_faces(full, cameras))
     console.print(f"surface: kept {len(fine.faces)} of {len(full.faces)} triangles, which cameras see")
     coarse = simplified(fine, options.faces, options.error)
@@ -125,7 +125,7 @@ def export_asset(
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
     )
-    vertices = run.capture.normalisation.to_world(torch.from_numpy(mesh.vertices)).numpy()
+    vertices = run.capture.normalization.to_world(torch.from_numpy(mesh.vertices)).numpy()
     write_asset(run, replace(mesh, vertices=vertices), textures, out)
     if not has_usd():
         remedy = "pip install 'neilfpp-method[usd]'"

@@ -43,7 +43,7 @@ def scene(root: Path, protocol: int = 4, kind: type = np.float64) -> Path:
 def test_cameras(tmp_path: Path, protocol: int, kind: type) -> None:
     capture = load_capture(scene(tmp_path, protocol, kind))
     assert capture.format == "nero"
-    assert (capture.normalisation.scale, capture.normalisation.center) == (1.0, (0.0, 0.0, 0.0))
+    assert (capture.normalization.scale, capture.normalization.center) == (1.0, (0.0, 0.0, 0.0))
     assert [view.name for view in capture.views] == [str(i) for i in range(VIEWS)]
     for i, view in enumerate(capture.views):
         seen = project(view.camera, torch.from_numpy(POINTS)).pixel.numpy()

@@ -86,7 +86,7 @@ def test_a_world_with_y_up_is_unchanged(tmp_path: Path) -> None:
     root = scene(tmp_path, world=y_up, applied_transform=np.pad(y_up, ((0, 0), (0, 1))).tolist())
     seen = seen_pixels(root, POINTS @ y_up.T)
     assert max(np.abs(seen[i] - pinhole_pixels(i)).max() for i in range(VIEWS)) < 1e-6
-    assert np.allclose(load_capture(root).normalisation.center, y_up @ CENTER, atol=0.2 * RADIUS)
+    assert np.allclose(load_capture(root).normalization.center, y_up @ CENTER, atol=0.2 * RADIUS)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_masks_and_the_scene_box_from_them(tmp_path: Path) -> None:
     capture = load_capture(edit(tmp_path, add))
     assert capture.scene_from == "masks"
     assert [view.mask.name for view in capture.views] == [f"{i:03d}.png" for i in range(VIEWS)]
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.25 * RADIUS)
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.25 * RADIUS)
 
 
 @pytest.mark.parametrize("normals", [True, False])
@@ -211,7 +211,7 @@ def test_the_point_cloud(tmp_path: Path, normals: bool) -> None:
         trimesh.PointCloud(points).export(tmp_path / "cloud.ply")
     capture = load_capture(tmp_path)
     assert capture.scene_from == "points"
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.05 * RADIUS)
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.05 * RADIUS)
     assert capture.point_cloud == (tmp_path / "cloud.ply" if normals else None)
 
 
