@@ -26,6 +26,7 @@ from neilfpp_method.evaluate.scene_metrics import light_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.structures import Material, Observed
@@ -90,8 +91,8 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     )
     for _ in range(fits):
         rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
-        seen, material = known.seen[rows], known.material[rows]
-        solve_light(light, seen, material, model.lobe, model.scene, objective, settings, first=False)
+        points = FitPoints(known.seen[rows], known.material[rows], model.lobe, model.scene)
+        solve_light(light, points, objective, settings, first=False)
 
 
 def line(run: Run, title: str) -> str:

@@ -14,7 +14,7 @@ from torch import nn
 
 from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
 from neilfpp_method.effects.material_search import is_search_due
-from neilfpp_method.effects.place_fit import place_transport
+from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import MIN_COSINE, SAME_NORMAL, Places
 from neilfpp_method.effects.review import improve_material
 from neilfpp_method.lighting.ring import Ring
@@ -110,7 +110,8 @@ class PlaceSolver(nn.Module):
         rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
         self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")
         transport = place_transport(places, model.lobe, model.scene)
-        first = find_first_light(places, transport, model.facts.median_radiance, model.brdf.metals)
+        data = PlaceData(places, transport, model.facts.median_radiance)
+        first = find_first_light(data, model.brdf.metals)
         if first is not None:
             self.say(first.summary())
             start_with(model, first)

@@ -14,8 +14,10 @@ from torch import Tensor
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import project
 from neilfpp_method.fields.exposure import at_mean_exposure
+from neilfpp_method.lighting.layered_transport import SharedPoints
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
+from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Observed
 
 __all__ = ["Places", "gather_places"]
@@ -65,6 +67,11 @@ class Places:
         sums = values.new_zeros(self.count, *values.shape[1:]).index_add(0, self.place, values)
         pixels = torch.bincount(self.place, minlength=self.count).clamp_min(1)
         return sums / pixels.view(-1, *[1] * (values.ndim - 1))
+
+    def shared_points(self) -> SharedPoints:
+        """One point per place, the mean of the points that its pixels show, from which rays are traced."""
+        position, normal = self.mean(self.observed.position), self.mean(self.observed.normal)
+        return SharedPoints(position, safe_normalize(normal), self.observed, self.place)
 
 
 @torch.no_grad()

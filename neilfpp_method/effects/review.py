@@ -16,7 +16,7 @@ from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.material_search import search_materials, teach
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.metals import metals_evidence
-from neilfpp_method.effects.place_fit import place_transport
+from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
@@ -133,11 +133,11 @@ def review_light(
         model.use(plan.config)
     first = None
     if model.lobe is not None:
-        transport = place_transport(places, model.lobe, model.scene)
+        data = PlaceData(places, place_transport(places, model.lobe, model.scene), typical)
         if plan.is_open("metals") and model.brdf.metals:
-            decisions.append(plan.decide("metals", metals_evidence(places, transport, typical), step))
+            decisions.append(plan.decide("metals", metals_evidence(data), step))
             model.use(plan.config)
-        first = find_first_light(places, transport, typical, model.brdf.metals)
+        first = find_first_light(data, model.brdf.metals)
     model.train(mode)
     return decisions, first
 

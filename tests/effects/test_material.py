@@ -10,22 +10,17 @@ import torch
 from neilfpp_method.effects.material import WORTH, judge_material
 from neilfpp_method.effects.material_grid import METALLICS
 from neilfpp_method.effects.noise import lobe_noise
-from neilfpp_method.effects.place_fit import (
-    DIRECTIONS,
-    ROWS,
-    PlaceFit,
-    fit_places,
-    place_errors,
-    place_transport,
-)
+from neilfpp_method.effects.place_data import DIRECTIONS, ROWS, place_transport
+from neilfpp_method.effects.place_fit import Permitted, PlaceFit, fit_places, place_errors
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.transport import from_texels, from_texels_at
+from neilfpp_method.lighting.layered_transport import SharedPoints, texel_layers
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES, Lobe
 from neilfpp_method.structures import Observed, SceneLight
-from tests.effects.balls import ball, sky
+from tests.effects.balls import ball, data_of, sky
 from tests.scenes import sphere_model, tiny_config
 from tests.train.small_runs import solved_light
 
@@ -48,17 +43,9 @@ def gain_of_metals(places: Places) -> tuple[float, float]:
     """Mean reduction of the error in held-back views by metals, and the share of places that are then
     metal.
     """
-    transport = place_transport(places, LOBE, None)
-    typical = places.observed.pixel.median().item()
-    back = places.view % 3 == 0
-    known, kept = torch.nonzero(~back)[:, 0], torch.nonzero(back)[:, 0]
-    paint, metal = (
-        fit_places(places.where(known), transport[known], typical, metals) for metals in (False, True)
-    )
-    errors = [
-        place_errors(fit, places.where(kept), transport[kept], typical).mean().item()
-        for fit in (paint, metal)
-    ]
+    split = data_of(places, LOBE).hold_back(0, 3)
+    paint, metal = (fit_places(split.known, Permitted(metals)) for metals in (False, True))
+    errors = [place_errors(fit, split.held_back).mean().item() for fit in (paint, metal)]
     assert paint.metallic.max() == 0
     return errors[0] - errors[1], (metal.metallic > len(METALLICS) // 2).float().mean().item()
 
@@ -73,9 +60,7 @@ def test_metals_reduce_the_error_for_a_metal_ball_and_not_for_a_painted_one():
 
 
 def judged(places: Places, *names: str) -> dict:
-    typical = places.observed.pixel.median().item()
-    transport = place_transport(places, LOBE, None)
-    return judge_material(places, transport, typical, frozenset(names), metals=False).measured
+    return judge_material(data_of(places, LOBE), frozenset(names), metals=False).measured
 
 
 def test_specular_reflection_is_found_on_a_shiny_ball_and_not_on_a_dull_one():
@@ -125,12 +110,11 @@ def test_a_single_roughness_is_the_same_everywhere_and_is_trained():
 
 
 def test_transport_at_several_roughnesses_agrees_with_each_alone():
-    observed, place = ball_of(0.0).observed[:20], torch.arange(20)
+    observed = ball_of(0.0).observed[:20]
+    shared = SharedPoints(observed.position, observed.normal, observed, torch.arange(20))
     environment = EnvironmentLight(48, 1.0)
     torch.manual_seed(3)
-    draws = [
-        from_texels_at(environment, observed, observed, place, (0.3, 0.7), LOBE, None) for _ in range(16)
-    ]
+    draws = [texel_layers(environment, shared, (0.3, 0.7), LOBE, None) for _ in range(16)]
     both = torch.stack([drawn.sources.float() for drawn in draws]).mean(0)
     for k, roughness in enumerate((0.3, 0.7)):
         rough = torch.full((20, 1), roughness)

@@ -12,8 +12,9 @@ import torch
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.lamp_transport import from_lamps, in_sight, lamp_kernel
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material, Observed
 from tests.hard_cases.test_fields import DTYPES, assert_bounded

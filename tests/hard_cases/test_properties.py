@@ -21,8 +21,9 @@ from neilfpp_method.fields.encodings import direction_encoding, position_encodin
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.lamp_transport import from_lamps
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig
 from neilfpp_method.shading import LOBES, evaluate, sample_directions, srgb_to_linear
 from neilfpp_method.shading.brdf import GGX

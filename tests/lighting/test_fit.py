@@ -10,8 +10,9 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, Light, fit_light
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
-from neilfpp_method.lighting.transport import Transport, from_texels
+from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
 from neilfpp_method.shading.sampling import sample_directions

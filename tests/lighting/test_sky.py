@@ -12,9 +12,9 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.sky import HALF_WEIGHT_SPREAD, SkySightings
-from neilfpp_method.lighting.transport import from_texels
 from neilfpp_method.shading.color import linear_to_srgb
 from tests.lighting.surfaces import material, points
 

@@ -14,9 +14,11 @@ from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.fit_points import FitPoints
+from neilfpp_method.lighting.lamp_transport import from_lamps
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
-from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import LightFitConfig, MapLightConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material, Observed
@@ -68,7 +70,8 @@ def solve(
     base_color_known: bool = False,
 ) -> Evidence | None:
     objective = Objective("linear", unit, config.fit.steps, base_color_known)
-    return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
+    points = FitPoints(seen, of, GGX, None)
+    return solve_light(LightModel(environment, lamps), points, objective, config, first)
 
 
 def solved(seen: Observed, of: Material, rounds: int, base_color_known: bool = False) -> tuple[Lamps, object]:
@@ -190,7 +193,8 @@ def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(m
         torch.manual_seed(0)
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
         objective = Objective("linear", unit, CONFIG.fit.steps)
-        solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, lamps_if_undecided=doubt)
+        points = FitPoints(seen, of, GGX, None)
+        solve_light(light, points, objective, CONFIG, first=False, lamps_if_undecided=doubt)
         lit.append(light.lamps.count)
     assert lit[0] == 0
     assert lit[1] > 0
