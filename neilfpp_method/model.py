@@ -20,7 +20,6 @@ from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import (
     Sources,
     arriving,
-    draw_directions,
     incident_radiance,
     scene_tracer,
     trace_light,
@@ -31,7 +30,7 @@ from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, Sta
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.facts import SceneFacts, radiance_units
 from neilfpp_method.settings.types import NeilfConfig, ShadingConfig
-from neilfpp_method.shading import LOBES, Lobe, initial_albedo, shade
+from neilfpp_method.shading import LOBES, Lobe, Sampling, initial_albedo, sample_directions, shade
 from neilfpp_method.structures import (
     Incident,
     LossTerm,
@@ -267,8 +266,9 @@ class NeilfModel(nn.Module):
         samples: int,
     ) -> Incident:
         """Incident light along `samples` directions per point; no gradient flows through their choice."""
-        n, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
-        drawn = draw_directions(sampler, self.light, n, wo, roughness, samples, self.lobe, self.training)
+        sampling = Sampling(self.config.shading.sampler, samples, self.lobe, stochastic=self.training)
+        n, roughness = normal.detach(), material.roughness.detach()
+        drawn = sample_directions(sampling, n, wo, roughness, self.light.technique(n))
         return arriving(self.sources, position, drawn)
 
     @timed("tracing")

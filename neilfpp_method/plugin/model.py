@@ -43,7 +43,7 @@ from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
-from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.shading.sampling import combine, cosine
 from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
@@ -335,13 +335,11 @@ class NeilfMethod(Model):
         rows = torch.nonzero(maps.roughness[:, 0])[:, 0]
         if not len(rows):
             return light
-        normal, wo = maps.normal[rows], -rays.directions[rows]
+        normal = maps.normal[rows]
         position = rays.origins[rows] + maps.depth[rows] * rays.directions[rows]
         count = self.config.neilf.shading.train_samples
         # The pdf of the cosine sampler cancels the cosine, so the estimate is a plain mean.
-        drawn = sample_directions(
-            "cosine", normal, wo, maps.roughness[rows], count, self.neilf.lobe, stochastic=False
-        )
+        drawn = combine([(cosine(normal), count)], stochastic=False)
         light[rows] = self.neilf.incident_light(position, drawn.wi).mean(dim=1)
         return light
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.hosts.base import HasSurfaceWidth
 from neilfpp_method.schedule import (
     StagePosition,
     Total,
@@ -75,16 +75,16 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
-        review_before_stage(run, model, 0)
+        review_before_stage(run, step)
     while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
-        step = _train_stage(run, model, optimizer, step, position)
+        step = _train_stage(run, optimizer, position, step)
         if run.fabric.is_global_zero:
             with timed("checks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
             with timed("checks", apart=True):
-                review_before_stage(run, model, step)
+                review_before_stage(run, step)
         _save(run, optimizer, step, names=(position.stage.value, LAST))
         with timed("checks", apart=True):
             model.eval()
@@ -92,12 +92,9 @@ def train(run: Training) -> None:
             model.train()
 
 
-def _train_stage(
-    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition
-) -> int:
+def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: StagePosition, step: int) -> int:
     """Train the remaining steps of a stage. Returns the number of steps trained so far in all stages."""
-    settings = run.config.train
-    stage = position.stage
+    model, stage, settings = run.model, position.stage, run.config.train
     model.freeze_for(stage)
     # A data-parallel wrapper is made for each stage, because it fixes the set of trained parameters.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
@@ -112,19 +109,20 @@ def _train_stage(
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
             at = StagePosition(stage, number, length)
-            set_rates(optimizer, run.config.optimizer, at, background_waits=not run.model.facts.far_points)
+            set_rates(optimizer, run.config.optimizer, at, background_waits=not model.facts.far_points)
             with timed("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
-            moment = Moment.before_step(model, batch, at)
+            moment = Moment.before_step(model, batch, at, step)
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
-            stop = _update(run, model, optimizer, computed.terms, total, moment, step)
-            solve_light(run, model, computed, step)
+            stop = _update(run, optimizer, computed.terms, total, moment)
+            solve_light(run, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
-        search_material(run, model, StagePosition(stage, number, length), step)
-        _check_quality(run, model, StagePosition(stage, number, length), step)
+        reached = StagePosition(stage, number, length)
+        search_material(run, reached, step)
+        _check_quality(run, reached, step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number == length:
             # `train` saves the end of a stage under its name, and a stop takes effect after that.
@@ -148,20 +146,14 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
 
 
 @timed("checks", apart=True)
-def _check_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+def _check_quality(run: Training, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
-        run.quality.check_when_due(model, position, step, run.ledger.total)
+        run.quality.check_when_due(run.model, position, step, run.ledger.total)
 
 
 @timed("optimiser")
 def _update(
-    run: Training,
-    model: NeilfModel,
-    optimizer: torch.optim.Optimizer,
-    terms: LossTerms,
-    total: Total,
-    moment: Moment,
-    step: int,
+    run: Training, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, moment: Moment
 ) -> bool:
     """Take an optimizer step. A step whose loss or gradient is not finite is skipped and reported.
 
@@ -171,7 +163,7 @@ def _update(
     if total.loss.requires_grad:
         with timed("gradients"):
             run.fabric.backward(total.loss)
-    norms = gradient_norms(model)
+    norms = gradient_norms(run.model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
     # The only transfer from the device in a step. All processes use the mean over the processes, so that they
@@ -180,19 +172,19 @@ def _update(
     loss, decibels, stopping, *mean_norms = means
     if all(math.isfinite(value) for value in (loss, *mean_norms)):
         optimizer.step()
-        limit_surface_width(model.host, run.config.volume, moment.position)
+        limit_surface_width(run.model.host, run.config.volume, moment.position)
         run.skipped_in_a_row = 0
     else:
-        named_norms = dict(zip(norms, mean_norms, strict=True))
-        _skip(run, total, named_norms, _keep_skipped(run, model, moment, step), step)
+        _skip(run, total, dict(zip(norms, mean_norms, strict=True)), moment)
     run.reporter.step(loss, decibels)
-    if step % LOG_EVERY == 0:
-        _log(run, model, total, decibels, loss, step)
+    if moment.step % LOG_EVERY == 0:
+        _log(run, total, decibels, loss, moment.step)
     return stopping > 0.0
 
 
-def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, step: int) -> None:
-    """Count and report a skipped step; raise `Diverged` after too many in a row."""
+def _skip(run: Training, total: Total, norms: Mapping[str, float], moment: Moment) -> None:
+    """Count, store and report a skipped step; raise `Diverged` after too many in a row."""
+    kept = _keep_skipped(run, moment)
     run.skipped += 1
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
@@ -202,7 +194,9 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, st
         if culprits
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
-    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far){kept}")
+    run.reporter.warn(
+        f"step {moment.step} skipped: {where} is not finite ({run.skipped} skipped so far){kept}"
+    )
     if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
             f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
@@ -211,15 +205,15 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, st
         )
 
 
-def _keep_skipped(run: Training, model: NeilfModel, moment: Moment, step: int) -> str:
+def _keep_skipped(run: Training, moment: Moment) -> str:
     """Store a skipped step and return the end of its message. A full disk does not stop the training."""
     if not run.fabric.is_global_zero:
         return ""
     try:
-        kept = keep_step(run.path, model, moment, step)
+        kept = keep_step(run.path, run.model, moment)
     except UserError as error:
         return f"; the step is not stored: {error.problem}"
-    return f"; see neilfpp replay {shlex.quote(str(run.path))} {step}" if kept else ""
+    return f"; see neilfpp replay {shlex.quote(str(run.path))} {moment.step}" if kept else ""
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
@@ -272,17 +266,16 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
     run.quality.checks += read_checks(run.path, saved["step"])
-    apply_plan(run, run.model)
+    apply_plan(run)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 
 
-def _log(run: Training, model: NeilfModel, total: Total, decibels: float, loss: float, step: int) -> None:
+def _log(run: Training, total: Total, decibels: float, loss: float, step: int) -> None:
     values = {"loss/total": loss, "psnr": decibels, "steps_skipped": float(run.skipped)}
     values |= {f"loss/{name}": value.item() for name, value in total.terms.items()}
-    width = getattr(model.host, "surface_width", None)
-    if width is not None:
-        values["beta"] = width().item()
+    if isinstance(run.model.host, HasSurfaceWidth):
+        values["beta"] = run.model.host.surface_width().item()
     if run.fits:
         values |= {
             f"light/{name}": float(getattr(run.fits[-1], name)) for name in ("gain", "deviation", "lamps")

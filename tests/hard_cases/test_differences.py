@@ -42,7 +42,7 @@ def keep_first(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -
 @pytest.fixture
 def samples_stay(monkeypatch):
     keep_first(monkeypatch, volsdf_module, "error_bounded_samples")
-    keep_first(monkeypatch, model_module, "draw_directions")
+    keep_first(monkeypatch, model_module, "sample_directions")
 
 
 def small_model(light: str) -> NeilfModel:

@@ -25,7 +25,7 @@ from neilfpp_method.lighting.lamp_transport import from_lamps
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig
-from neilfpp_method.shading import LOBES, evaluate, sample_directions, srgb_to_linear
+from neilfpp_method.shading import LOBES, Sampling, evaluate, sample_directions, srgb_to_linear
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.color import linear_to_srgb, residual
 from neilfpp_method.structures import Material
@@ -150,7 +150,7 @@ def test_samplers_draw_unit_directions_of_finite_density(
 ):
     n, wo = direction(normals, dtype), direction(to_viewer, dtype)
     roughness = torch.from_numpy(rough).to(dtype)
-    drawn = sample_directions(kind, n, wo, roughness, count, GGX, stochastic=moves)
+    drawn = sample_directions(Sampling(kind, count, GGX, stochastic=moves), n, wo, roughness)
     assert drawn.wi.shape == (ROWS, count, 3)
     # Normals of half precision are themselves off unit length by half a unit in the last place.
     assert (drawn.wi.norm(dim=-1) - 1).abs().max() < max(1e-5, 8 * torch.finfo(dtype).eps)

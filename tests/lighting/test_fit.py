@@ -15,7 +15,7 @@ from neilfpp_method.lighting.objective import Objective, Target, nearest_points,
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.shading.sampling import Sampling, sample_directions
 from neilfpp_method.structures import Incident, Material, Observed
 from tests.lighting.surfaces import half_room, material, patches, points
 
@@ -56,7 +56,9 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     radiance = environment.log_radiance.exp().flatten(1).t()
     carried = sum(one.outgoing(of, radiance) for one in several) / len(several)
 
-    drawn = sample_directions("mis", seen.normal, seen.wo, of.roughness, 16_384, GGX, stochastic=True)
+    drawn = sample_directions(
+        Sampling("mis", 16_384, GGX, stochastic=True), seen.normal, seen.wo, of.roughness
+    )
     arriving = environment.radiance(seen.position, drawn.wi)
     arriving = torch.where(drawn.wi[..., 2:] < 0, 0.7, arriving)
     expected = shade(of, seen.normal, seen.wo, Incident.of(drawn, arriving), GGX).color
