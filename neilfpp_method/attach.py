@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +179,7 @@ class AttachedNeilf(nn.Module):
             return self.model.maps(rays)
         starts = range(0, max(len(rays), 1), EVAL_RAYS)
         parts = [self.model.maps(rays[i : i + EVAL_RAYS], hits=rendered[i : i + EVAL_RAYS]) for i in starts]
-        return Maps(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Maps)))
+        return Maps.joined(parts)
 
     def param_groups(self) -> list[dict[str, Any]]:
         """Groups for `optimizer.add_param_group`, one per field, with the learning rates of the settings.
@@ -360,7 +360,7 @@ def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:
 
 def _cloned(rays: RayBatch) -> RayBatch:
     """Copies of rays that are not inference tensors, so that a host may compute gradients with them."""
-    return RayBatch(rays.origins.clone(), rays.directions.clone())
+    return rays.map(torch.Tensor.clone)
 
 
 def _inner(host: object) -> object:

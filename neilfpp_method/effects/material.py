@@ -110,9 +110,9 @@ def material_evidence(
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)
     data = PlaceData(places, transport, model.facts.median_radiance)
     judged = judge_material(data, names, model.brdf.metals)
-    if "lobe-sampling" in names:
-        judged.measured["lobe-sampling"] = lobe_noise(model, places, judged.glossy)
-    return judged.measured
+    if "lobe-sampling" not in names:
+        return judged.measured
+    return {**judged.measured, "lobe-sampling": lobe_noise(model, places, judged.glossy)}
 
 
 def seconds_of_evidence(device: torch.device) -> float:
@@ -139,8 +139,8 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Model:
-    """The set of materials and lights that a fit may choose from.
+class Variant:
+    """A fit with all effects, or without one of them.
 
     Attributes:
         permitted: metals and maps.
@@ -153,7 +153,7 @@ class Model:
     roughness: int | None = None
 
     def restrict(self, data: PlaceData) -> PlaceData:
-        """The data with only the specular layers that this model permits."""
+        """The data with only the specular layers that this variant permits."""
         return replace(data, transport=self._restrict(data.transport))
 
     def _restrict(self, transport: Transport) -> Transport:
@@ -169,7 +169,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Explained:
-    """A fit of a model and its errors.
+    """A fit of a variant and its errors.
 
     Attributes:
         fit: the fitted light and materials.
@@ -182,12 +182,12 @@ class Explained:
     error: Float[Tensor, " P"]
 
 
-def explain(split: Split, model: Model, start: PlaceFit | None = None) -> Explained:
-    """Fit a model, from a given fit on if there is one, and evaluate it in the held-back views."""
-    known, held_back = model.restrict(split.known), model.restrict(split.held_back)
-    fit = fit_places(known, model.permitted, start, ROUNDS if start is None else CARRIED_ROUNDS)
-    if model.roughness is not None:
-        fit = replace(fit, roughness=torch.full_like(fit.roughness, model.roughness))
+def explain(split: Split, variant: Variant, start: PlaceFit | None = None) -> Explained:
+    """Fit a variant, from a given fit on if there is one, and evaluate it in the held-back views."""
+    known, held_back = variant.restrict(split.known), variant.restrict(split.held_back)
+    fit = fit_places(known, variant.permitted, start, ROUNDS if start is None else CARRIED_ROUNDS)
+    if variant.roughness is not None:
+        fit = replace(fit, roughness=torch.full_like(fit.roughness, variant.roughness))
     return Explained(fit, place_errors(fit, known).mean().item(), mean_errors(fit, held_back))
 
 
@@ -202,10 +202,10 @@ def judge_material(data: PlaceData, names: frozenset[str], metals: bool) -> Judg
     """
     splits = [data.hold_back(turn, FOLDS) for turn in range(TURNS)]
 
-    def explain_all(model: Model) -> list[Explained]:
-        return [explain(split, model) for split in splits]
+    def explain_all(variant: Variant) -> list[Explained]:
+        return [explain(split, variant) for split in splits]
 
-    glossy = Model(Permitted(metals))
+    glossy = Variant(Permitted(metals))
     glossy_fits = explain_all(glossy)
     measured: dict[str, Measurement] = {}
     if "varying-roughness" in names:
@@ -218,11 +218,11 @@ def judge_material(data: PlaceData, names: frozenset[str], metals: bool) -> Judg
         counted = [(one.fit.roughness - shared).abs() >= MIN_INDEX_DIFFERENCE for one in glossy_fits]
         measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
     if "reflection" in names:
-        matte = Model(Permitted(metals=False), reflects=False)
+        matte = Variant(Permitted(metals=False), reflects=False)
         measured["reflection"] = _saved("reflection", explain_all(matte), glossy_fits)
     for name, form in LIGHT_FORMS.items():
         if name in names:
-            limited = Model(Permitted(metals, form=form))
+            limited = Variant(Permitted(metals, form=form))
             measured[name] = _saved(name, explain_all(limited), glossy_fits)
     return Judged({name: measured[name] for name in SAVED if name in names}, glossy_fits[0].fit)
 

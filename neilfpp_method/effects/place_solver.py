@@ -8,6 +8,7 @@ neighbours that other views showed, and neighbours together are a place.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import nn
@@ -49,7 +50,7 @@ class PlaceSolver(nn.Module):
     def __init__(self, response: str, say: Callable[[str], object]) -> None:
         super().__init__()
         self.response, self.say = response, say
-        self.points = Ring(PIXELS, 12)
+        self.points = Ring(PIXELS, Observed.WIDTH)
         self._steps, self._tried, self._searched = 0, False, -1
 
     def is_waiting(self, light_solver: LightSolver) -> bool:
@@ -60,11 +61,10 @@ class PlaceSolver(nn.Module):
     def observe(self, surface: Observed) -> None:
         """Remember the surface points of a step that trains material, in place of the oldest."""
         usable = (surface.normal * surface.wo).sum(-1) > MIN_COSINE
-        pixel = surface.pixel
         if self.response == "srgb":
-            usable = usable & (pixel.amax(-1) < CLIPPED)
-            pixel = srgb_to_linear(pixel)
-        self.points.keep(torch.cat((surface.position, surface.normal, surface.wo, pixel), -1)[usable])
+            usable = usable & (surface.pixel.amax(-1) < CLIPPED)
+            surface = replace(surface, pixel=srgb_to_linear(surface.pixel))
+        self.points.keep(surface.rows()[usable])
         self._steps += 1
 
     def before_step(self, model: NeilfModel, light_solver: LightSolver, position: StagePosition) -> None:
@@ -89,7 +89,7 @@ class PlaceSolver(nn.Module):
 
         There are no places before the first point.
         """
-        observed = Observed(*self.points.kept().split(3, -1))
+        observed = Observed.of_rows(self.points.kept())
         count = len(observed)
         center = observed[torch.randperm(count, device=observed.position.device)[:PLACES]]
         distance = torch.cdist(observed.position, center.position)

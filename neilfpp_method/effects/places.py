@@ -125,11 +125,5 @@ def gather_places(
     if not parts:
         none = torch.zeros(0, dtype=torch.long, device=position.device)
         return Places(len(position), none, none, Observed(*[position[:0]] * 4))
-    observed = Observed(
-        position=torch.cat([part.observed.position for part in parts]),
-        normal=torch.cat([part.observed.normal for part in parts]),
-        wo=torch.cat([part.observed.wo for part in parts]),
-        pixel=torch.cat([part.observed.pixel for part in parts]),
-    )
     place, view = torch.cat([part.place for part in parts]), torch.cat([part.view for part in parts])
-    return Places(len(position), place, view, observed)
+    return Places(len(position), place, view, Observed.joined([part.observed for part in parts]))

@@ -165,8 +165,7 @@ def material_deviation(
             sightings = block_sightings[rows.start - block : rows.stop - block]
             parts.append(_deviation(model, evidence, position[rows], normal[rows], sightings))
             on_progress(rows.stop / len(position))
-    deviation = Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
-    return _smoothed(deviation, position, normal)
+    return _smoothed(Deviation.joined(parts), position, normal)
 
 
 def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:

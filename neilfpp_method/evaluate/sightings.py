@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -64,9 +64,7 @@ class TrainingViews:
             view = self.pixels.view(i, gradients=False)
             rows = torch.nonzero((view.mask > 0.5) & self.pixels.valid(i))[:, 0]
             batches.append(view[rows[:: max(1, math.ceil(len(rows) / each))]])
-        return PixelBatch(
-            **{f.name: torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(PixelBatch)}
-        )
+        return PixelBatch.joined(batches)
 
     @torch.no_grad()
     def sightings(

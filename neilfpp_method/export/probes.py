@@ -30,10 +30,7 @@ def spread_over_surface(run: Run, count: int) -> OrientedPoints:
         UserError: no training view sees a surface.
     """
     device = next(run.model.parameters()).device
-    parts = list(_visible_points(run, device))
-    points = OrientedPoints(
-        torch.cat([part.position for part in parts]), torch.cat([part.normal for part in parts])
-    )
+    points = OrientedPoints.joined(list(_visible_points(run, device)))
     if not len(points):
         raise UserError(f"{run.path}: no training view sees a surface", "train the run for longer")
     return points[spread(points, count)]

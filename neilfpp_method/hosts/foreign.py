@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
+from neilfpp_method.hosts.answers import as_hits, no_hits
 from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
 from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
@@ -159,4 +159,4 @@ class ForeignHost(nn.Module):
                 hits.position.dtype,
                 digits,
             )
-        return in_precision(hits, rays.origins.dtype)
+        return hits.map(lambda t: t.to(rays.origins.dtype))

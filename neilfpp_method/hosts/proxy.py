@@ -12,9 +12,9 @@ few dozen steps.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -120,7 +120,7 @@ class SurfaceProxy(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SurfaceProxy:
         """Convert the module: `nn.Module` calls this for `to`, `double` and `cuda`, on any parent as well."""
         super()._apply(fn, recurse)
-        self._pending = [(_converted(rays, fn), _converted(hits, fn)) for rays, hits in self._pending]
+        self._pending = [(rays.map(fn), hits.map(fn)) for rays, hits in self._pending]
         # The grid is rebuilt from the converted points at its next use.
         self._surface = None
         return self
@@ -161,7 +161,8 @@ class SurfaceProxy(nn.Module):
         """Measure the error on the rays since the last refresh, add them, and rebuild the grid."""
         if not self._pending:
             return
-        rays, hits = (_joined(parts) for parts in zip(*self._pending, strict=True))
+        pending_rays, pending_hits = zip(*self._pending, strict=True)
+        rays, hits = RayBatch.joined(pending_rays), SurfaceHits.joined(pending_hits)
         self._pending.clear()
         hit = hits.is_hit(self.hit_share) & (hits.normal.norm(dim=-1) > 0.5)
         distance = torch.where(hit, (hits.position - rays.origins).norm(dim=-1), torch.inf)
@@ -317,27 +318,14 @@ class SurfaceProxy(nn.Module):
         self.steps, self._surface, self._report = state["steps"], None, None
         like = self.points.rows
         self._pending = [
-            tuple(_converted(_made(kind, tensors), lambda t: t.to(like)) for kind in (RayBatch, SurfaceHits))
+            tuple(_made(kind, tensors).map(lambda t: t.to(like)) for kind in (RayBatch, SurfaceHits))
             for tensors in state["pending"]
         ]
-
-
-Part = TypeVar("Part", RayBatch, SurfaceHits)
-
-
-def _joined(parts: Sequence[Part]) -> Part:
-    """All parts as one batch."""
-    return type(parts[0])(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0])))
 
 
 def _tensors(part: RayBatch | SurfaceHits) -> dict[str, Tensor]:
     return {f.name: getattr(part, f.name) for f in fields(part)}
 
 
-def _converted(part: Part, fn: Callable[[Tensor], Tensor]) -> Part:
-    """The same structure with `fn` applied to each tensor, all of which are floating point."""
-    return type(part)(**{name: fn(tensor) for name, tensor in _tensors(part).items()})
-
-
-def _made(kind: type[Part], tensors: Mapping[str, Tensor]) -> Part:
+def _made(kind: type[RayBatch | SurfaceHits], tensors: Mapping[str, Tensor]) -> RayBatch | SurfaceHits:
     return kind(**{f.name: tensors[f.name] for f in fields(kind)})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -253,13 +253,7 @@ class VolSdfHost(nn.Module):
             return missed
         part = Interval(span.interval.near[rows], span.interval.far[rows])
         visible = self._march(rays[rows], part).hits
-        return replace(
-            missed,
-            **{
-                f.name: getattr(missed, f.name).index_put((rows,), getattr(visible, f.name))
-                for f in fields(SurfaceHits)
-            },
-        )
+        return missed.map_named(lambda name, values: values.index_put((rows,), getattr(visible, name)))
 
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
         """Sample and blend rays; `part` is the part of each ray to sample, if it is known."""

@@ -70,10 +70,7 @@ class TexelRays:
         wi, number, weight = (
             torch.cat([getattr(part, name) for part in parts]) for name in ("wi", "number", "weight")
         )
-        met = None
-        if parts[0].met is not None:
-            names = ("hit", "radiance", "distance")
-            met = SceneLight(*(torch.cat([getattr(part.met, name) for part in parts]) for name in names))
+        met = None if parts[0].met is None else SceneLight.joined([part.met for part in parts])
         return TexelRays(wi, number, weight, parts[0].texels, met)
 
     def __getitem__(self, points: Tensor) -> TexelRays:

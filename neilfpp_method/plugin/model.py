@@ -212,7 +212,7 @@ class NeilfMethod(Model):
         settings = self.config.neilf
         seed_step(settings.train.seed, -4 - step)
         plan, pixels = Plan.begin(EffectRequest("as-set"), settings), self.pixels.on(self.device)
-        _, first = review_light(plan, self.neilf, pixels, step)
+        first = review_light(plan, self.neilf, pixels, step).first
         if first is not None:
             CONSOLE.log(first.summary())
             start_with(self.neilf, first)

@@ -81,11 +81,11 @@ def scene_facts(
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
     return SceneFacts(
-        response,
-        median,
-        scale,
-        kind,
-        color or (0.0, 0.0, 0.0),
+        response=response,
+        median_radiance=median,
+        radiance_scale=scale,
+        background=kind,
+        background_color=color or (0.0, 0.0, 0.0),
         far_points=capture.scene_from == "focus",
         log_gains=() if log_gains is None else tuple(log_gains.flatten().tolist()),
     )

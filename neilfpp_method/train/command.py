@@ -38,7 +38,7 @@ from neilfpp_method.train.build import (
     scene_facts,
 )
 from neilfpp_method.train.checkpoint import last_checkpoint
-from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.device import pick_device, waiting
 from neilfpp_method.train.effects_record import write_plan
 from neilfpp_method.train.health_record import health_summary
 from neilfpp_method.train.launch import launch
@@ -58,7 +58,7 @@ from neilfpp_method.train.run import PIXELS, create_run
 from neilfpp_method.train.start import start_geometry
 from neilfpp_method.train.stopping import continue_command, stop_request
 from neilfpp_method.train.training import Training
-from neilfpp_method.train.work_record import waiting, write_work
+from neilfpp_method.train.work_record import write_work
 
 __all__ = ["run_training"]
 

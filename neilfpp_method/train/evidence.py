@@ -81,7 +81,8 @@ def _start_light(run: Training, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -4 - step)
-        decisions, first = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        review = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        decisions, first = review.decisions, review.first
         _report(run, decisions)
         if first is not None:
             run.reporter.say(first.summary())

@@ -39,10 +39,10 @@ from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.checkpoint import FORMAT, LAST, checkpoint_path, load_checkpoint, load_weights
 from neilfpp_method.train.effects_record import read_plan
-from neilfpp_method.train.environment import environment
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.lock import LOCK
 from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.provenance import provenance
 
 __all__ = [
     "BESIDE_NERFSTUDIO",
@@ -184,7 +184,7 @@ def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: Sc
     description = {
         "capture.json": dataclasses.asdict(source),
         "scene.json": dataclasses.asdict(facts),
-        "environment.json": environment(),
+        "environment.json": provenance(),
         # The settings are written last, because a folder that contains them is a run.
         "config.json": {"format": FORMAT, "config": to_dict(config)},
     }

@@ -182,13 +182,13 @@ def test_without_time_for_the_initial_light_training_starts_from_an_even_one(tmp
     capture = make_capture(tmp_path / "many", views=9)
     training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
     plan = Plan.begin(parse_effects("auto"), training.config)
-    decisions, light = review_light(plan, training.model, training.pixels, 0, most=0)
-    assert light is None
-    assert {(decision.effect, decision.on) for decision in decisions} == {
+    review = review_light(plan, training.model, training.pixels, 0, most=0)
+    assert review.first is None
+    assert {(decision.effect, decision.on) for decision in review.decisions} == {
         ("long-tails", True),
         ("metals", True),
     }
-    assert all("the budget leaves no time for it" in decision.reason for decision in decisions)
+    assert all("the budget leaves no time for it" in decision.reason for decision in review.decisions)
     planned = BudgetPlan(60.0, "usual", Costs({}), places_looked_at=True, light_pixels=0)
     planned_effects(planned, plan)
     assert "20% of the budget" in plan.newest("long-tails").reason
