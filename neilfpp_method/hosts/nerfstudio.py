@@ -139,9 +139,8 @@ class NerfstudioHost(nn.Module):
             outputs, NORMALS, "switch its normals on (nerfacto: predict_normals=True), or use a surface model"
         )
         normal = 2.0 * outputs[name] - 1.0 if name in COLOR_CODED else outputs[name]
-        opacity = outputs[self._first(outputs, ("accumulation",), "have it output the sum of its weights")][
-            :, 0
-        ]
+        weights = self._first(outputs, ("accumulation",), "have it output the sum of its weights")
+        opacity = outputs[weights][:, 0]
         drawn = outputs[self._first(outputs, ("rgb",), "use a model that renders a color")]
         linear = srgb_to_linear(drawn) if self.response == "srgb" else drawn
         return SurfaceHits(
