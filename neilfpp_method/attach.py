@@ -35,6 +35,7 @@ from neilfpp_method.hosts.batches import check_batch, check_like, check_points, 
 from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.first_batches import FirstBatches
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
+from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
@@ -171,8 +172,9 @@ class AttachedNeilf(nn.Module):
                 raise UserError(
                     f"{host_name(self.model.host)} takes rays", "give data.views.camera_rays(camera)"
                 )
+            camera, rays = rays, rays_like(rays, next(self.model.brdf.parameters()))
             with torch.no_grad():
-                rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
+                hits = self.model.host.image_hits(camera, rays)
         self._check_device_and_dtype("rays", rays.origins)
         rendered = self._host_hits(rays, hits, moves_host=False)
         if rendered is None:

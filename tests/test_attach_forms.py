@@ -214,7 +214,7 @@ def test_a_checkpoint_of_another_precision_is_read():
     fresh = attach_neilf(Ball().double(), solved_light(tiny_config())).double()
     fresh.load_state_dict(state)
     assert fresh.proxy._pending
-    assert {rays.origins.dtype for rays, _ in fresh.proxy._pending} == {torch.float64}
+    assert {pending.rays.origins.dtype for pending in fresh.proxy._pending} == {torch.float64}
     fresh.proxy.refresh()
 
 

@@ -10,13 +10,12 @@ import logging
 from collections.abc import Collection
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import as_hits, no_hits
 from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
-from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.settings.types import NeilfConfig
@@ -114,8 +113,8 @@ class ForeignHost(nn.Module):
             )
         return no_hits(rays) if len(rays) == 0 else self.read(rays, self.inner.render(rays))
 
-    def image_hits(self, camera: Camera, like: Tensor) -> tuple[RayBatch, SurfaceHits]:
-        """The rays of all pixels of a camera, and the host's hits.
+    def image_hits(self, camera: Camera, rays: RayBatch) -> SurfaceHits:
+        """The hits of all pixels of a camera, whose rays are given, by a host that draws whole images.
 
         Raises:
             UserError: the host has no `render_image`.
@@ -124,8 +123,7 @@ class ForeignHost(nn.Module):
             raise UserError(
                 f"{self.name} has no render_image(camera)", "give rays: data.views.camera_rays(camera)"
             )
-        rays = rays_like(camera, like)
-        return rays, self.read(rays, self.inner.render_image(camera))
+        return self.read(rays, self.inner.render_image(camera))
 
     def read(self, rays: RayBatch, rendered: object) -> SurfaceHits:
         """Convert what the host rendered for these rays, in any form that `hosts.answers` reads.
