@@ -175,7 +175,7 @@ class AutogradNormals(Ball):
         return color, position, torch.where(normal.norm(dim=-1, keepdim=True) > 0.5, slope, 0.0)
 
 
-def test_inference_mode():
+def test_maps_render_in_inference_mode():
     """Maps can be rendered in it although hosts need autograd; what is attached in it can be trained."""
     host, rays = AutogradNormals(), ball_rays(16)
     with torch.inference_mode():

@@ -54,7 +54,7 @@ def test_rays_project_back_to_pixel_centers(tmp_path: Path, frame: str) -> None:
         assert (seen.depth > 0).all()
 
 
-def test_scene_frame(tmp_path: Path) -> None:
+def test_the_scene_frame_keeps_projections(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path))
     to_scene, to_world = capture.normalization.to_scene, capture.normalization.to_world
     north = torch.tensor([[CENTER[0], CENTER[1], CENTER[2] + RADIUS]], dtype=torch.float64)
@@ -121,7 +121,7 @@ def test_without_a_box_the_point_cloud_defines_the_scene(tmp_path: Path) -> None
 # ----------------------------------------------------------------------------------------- split and response
 
 
-def test_split(tmp_path: Path) -> None:
+def test_views_are_held_out_by_options_then_files_then_the_default(tmp_path: Path) -> None:
     make_capture(tmp_path, views=17, test=(4, 9))
 
     def held_out(**options) -> list[str]:
@@ -152,7 +152,7 @@ def test_response_comes_from_the_files_or_the_user(tmp_path: Path, hdr: bool) ->
     assert not load_capture(tmp_path, response="srgb").hdr
 
 
-def test_summary(tmp_path: Path) -> None:
+def test_the_summary_names_views_pixels_and_scene(tmp_path: Path) -> None:
     summary = load_capture(make_capture(tmp_path / "ball", masks=True)).summary.splitlines()
     assert summary[0] == "ball (sfm_scene): 6 views of 24×18, 5 to train on and 1 to test on"
     assert summary[1] == "pixels: linear HDR; mask files: 6; point cloud: oriented_pcd.ply"

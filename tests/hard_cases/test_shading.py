@@ -73,7 +73,7 @@ def assert_tame(value: torch.Tensor, leaves: dict[str, torch.Tensor], bound: flo
 @dtypes
 @lobes
 @pytest.mark.parametrize("part", ["diffuse", "specular"])
-def test_brdf(lobe, dtype, part):
+def test_the_brdf_is_bounded_and_not_negative(lobe, dtype, part):
     leaf, material, wo, wi = hard_scene(dtype)
     value = getattr(evaluate(material, leaf["n"], wo, wi, LOBES[lobe]), part)
     assert_tame(value, leaf, BOUND[dtype])
@@ -84,7 +84,7 @@ def test_brdf(lobe, dtype, part):
 @dtypes
 @lobes
 @pytest.mark.parametrize("light", [0.0, 1e6])
-def test_shade(lobe, dtype, light):
+def test_shaded_radiance_is_bounded_and_not_negative(lobe, dtype, light):
     leaf, material, wo, wi = hard_scene(dtype)
     leaf["radiance"] = torch.full_like(wi, light).requires_grad_()
     samples = IncidentSamples(wi, torch.full_like(wi[..., 0], 0.159))
@@ -106,7 +106,7 @@ def test_a_pdf_of_zero_causes_no_division_by_zero(lobe, dtype):
 @dtypes
 @lobes
 @pytest.mark.parametrize("kind", ["fibonacci", "cosine", "lobe", "mis"])
-def test_samplers(kind, lobe, dtype):
+def test_sampled_directions_and_their_estimate_are_bounded(kind, lobe, dtype):
     torch.manual_seed(0)
     leaf, material, wo, _ = hard_scene(dtype)
     samples = sample_directions(

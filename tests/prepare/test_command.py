@@ -297,7 +297,7 @@ def test_too_few_images(own, tmp_path, capfd, kept, says):
     assert not (tmp_path / "out").exists()
 
 
-def test_no_features(tmp_path, capfd):
+def test_photographs_without_features_are_refused(tmp_path, capfd):
     for i in range(4):
         write_exr(tmp_path / "photos" / f"{i}.exr", {"RGB": np.full((120, 160, 3), 0.5, np.float32)})
     refused(capfd, tmp_path / "photos", tmp_path / "out", says="have features")

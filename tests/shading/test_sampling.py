@@ -74,7 +74,7 @@ def test_the_reported_pdf_is_the_density_at_the_directions(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_determinism(kind):
+def test_only_stochastic_directions_depend_on_the_seed(kind):
     scene = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 2)
     still = [sample_directions(Sampling(kind, 8, GGX, stochastic=False), *scene).wi for _ in range(2)]
     assert torch.equal(*still)

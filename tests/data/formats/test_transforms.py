@@ -102,7 +102,7 @@ def test_a_world_with_y_up_is_unchanged(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("place", ["file", "frame"])
-def test_lenses(
+def test_lenses_project_as_in_opencv(
     tmp_path: Path, model: str | None, names: dict[str, float], fisheye: bool, place: str
 ) -> None:
     scene(tmp_path, camera_model=model, **({} if model else {"is_fisheye": fisheye}))
@@ -215,7 +215,7 @@ def test_the_point_cloud(tmp_path: Path, normals: bool) -> None:
     assert capture.point_cloud == (tmp_path / "cloud.ply" if normals else None)
 
 
-def test_split_lists(tmp_path: Path) -> None:
+def test_lists_of_files_split_the_views(tmp_path: Path) -> None:
     files = [f"images/{i:03d}.exr" for i in range(VIEWS)]
     scene(tmp_path, train_filenames=files[:4], val_filenames=files[4:5], test_filenames=files[5:])
     assert load_capture(tmp_path).test == {"005"}
@@ -227,7 +227,7 @@ def test_split_lists(tmp_path: Path) -> None:
     )
 
 
-def test_hdr_and_ldr(tmp_path: Path) -> None:
+def test_the_kind_of_files_determines_the_response(tmp_path: Path) -> None:
     assert load_capture(scene(tmp_path / "hdr")).hdr
     assert not load_capture(scene(tmp_path / "ldr", hdr=False)).hdr
     assert load_capture(edit(tmp_path / "ldr", lambda c: c.update(response="linear"))).hdr
