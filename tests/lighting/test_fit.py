@@ -23,9 +23,7 @@ from tests.lighting.surfaces import half_room, material, patches, points
 def fit(
     environment: EnvironmentLight,
     carried: Transport,
-    seen: Observed,
-    of: Material,
-    image: torch.Tensor,
+    target: Target,
     unit: float,
     steps: int,
     base_color_known: bool = False,
@@ -33,7 +31,7 @@ def fit(
     """Set a map by a fit without lamps."""
     start = Light(environment.log_radiance, torch.zeros(0, 3))
     objective = Objective("linear", unit, steps, base_color_known)
-    found = fit_light(start, carried, Target(seen.position, of, image), objective)
+    found = fit_light(start, carried, target, objective)
     environment.log_radiance.copy_(found.log_radiance)
 
 
@@ -104,7 +102,7 @@ def test_a_lamp_is_found_with_its_position_and_brightness(tint, made_of, known, 
     carried = from_texels(found, seen, of.roughness, GGX, None)
     guess = Material(of.base_color * tint, of.roughness, of.metallic)
     for number in steps:
-        fit(found, carried, seen, guess, image, image.median().item(), number, known)
+        fit(found, carried, Target(seen.position, guess, image), image.median().item(), number, known)
 
     green = found.log_radiance[1]
     row, column = divmod(int(green.argmax()), 48)
@@ -128,7 +126,7 @@ def test_texels_without_observations_follow_their_neighbours():
     image = from_texels(true, seen, of.roughness, GGX, None).outgoing(of, torch.full((512, 3), 2.0))
     found = EnvironmentLight(16, 0.5)
     carried = from_texels(found, seen, of.roughness, GGX, None)
-    fit(found, carried, seen, of, image, 1.0, steps=300)
+    fit(found, carried, Target(seen.position, of, image), 1.0, steps=300)
     assert found.log_radiance[:, -2:].exp().mean().item() == pytest.approx(2.0, rel=0.35)
 
 
@@ -148,7 +146,7 @@ def test_texels_that_few_points_see_do_not_become_a_sun():
     carried = from_texels(found, seen, of.roughness, GGX, None)
     image = carried.outgoing(of, torch.full((2048, 3), 2.0))
     image[:12] *= 5
-    fit(found, carried, seen, of, image, 1.0, steps=100)
+    fit(found, carried, Target(seen.position, of, image), 1.0, steps=100)
     assert found.log_radiance.exp().max() < 4.0
 
 
@@ -196,5 +194,5 @@ def test_a_map_without_a_finite_solution_is_unchanged():
     before = environment.log_radiance.clone()
     carried = from_texels(environment, seen, of.roughness, GGX, None)
     broken = torch.full((8, 3), math.inf)
-    fit(environment, carried, seen, of, broken, 1.0, steps=3)
+    fit(environment, carried, Target(seen.position, of, broken), 1.0, steps=3)
     assert torch.equal(environment.log_radiance, before)
