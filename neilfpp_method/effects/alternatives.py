@@ -22,7 +22,7 @@ SCALE = 0.33
 
 @dataclass(frozen=True)
 class Alternative:
-    """A set of materials.
+    """Materials that may explain places.
 
     Attributes:
         data: places with their pixels, and the transport to these for one specular lobe.

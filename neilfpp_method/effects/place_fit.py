@@ -113,21 +113,6 @@ class Permitted:
     form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = _any_map
 
 
-def seconds_of_step(pixels: int, device: torch.device) -> float:
-    """Measure the approximate time of one descent step on the light for this number of pixels, in seconds.
-
-    Most of a step is the multiplication of the transport matrix and of its transpose, which is timed.
-    """
-    transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
-    light = torch.ones(2 * ROWS**2, 3, device=device)
-    began = time.perf_counter()
-    for _ in range(TRIED):
-        back = transport.T @ (transport @ light)
-    # `item` waits for the device.
-    back.sum().item()
-    return (time.perf_counter() - began) / TRIED
-
-
 def fit_places(
     data: PlaceData, permitted: Permitted, start: PlaceFit | None = None, rounds: int = ROUNDS
 ) -> PlaceFit:
@@ -217,3 +202,18 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
 
 def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
     return base_color.clamp_min(MIN_BASE_COLOR).log().mean()
+
+
+def seconds_of_step(pixels: int, device: torch.device) -> float:
+    """Measure the approximate time of one descent step on the light for this number of pixels, in seconds.
+
+    Most of a step is the multiplication of the transport matrix and of its transpose, which is timed.
+    """
+    transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
+    light = torch.ones(2 * ROWS**2, 3, device=device)
+    began = time.perf_counter()
+    for _ in range(TRIED):
+        back = transport.T @ (transport @ light)
+    # `item` waits for the device.
+    back.sum().item()
+    return (time.perf_counter() - began) / TRIED
