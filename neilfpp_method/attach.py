@@ -150,7 +150,7 @@ class AttachedNeilf(nn.Module):
             on_object = hits[torch.nonzero(batch.mask > 0.5)[:, 0]]
             measured = measure_hits(self.model, on_object, self._with_material)
             self.watch.judge(measured, self.step_guard.skipped, self._steps)
-        return Health.of(self.watch.findings.values())
+        return self.watch.health
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
         """Render all maps of a view, one row per ray: material, shading, normal, depth (`structures.Maps`).

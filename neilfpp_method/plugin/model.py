@@ -26,7 +26,6 @@ from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import improve_material, light_places, review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
-from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
@@ -255,7 +254,7 @@ class NeilfMethod(Model):
         if ends:
             self.watch.pixels = self.watch.pixels.to(self.device)
             self.watch.after_stage(self.neilf, self.neilf.stages[position.stage], self.guard.skipped, done)
-            CONSOLE.log(f"health after {position.stage.value}: {Health.of(self.watch.findings.values())}")
+            CONSOLE.log(f"health after {position.stage.value}: {self.watch.health}")
             if self.proxy is not None and self.proxy.report() is not None:
                 CONSOLE.log(str(self.proxy.report()))
         # The condition under which nerfstudio saves.

@@ -20,7 +20,6 @@ from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound
-from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.inspection.findings import problems_of_poses
 from neilfpp_method.model import NeilfModel
@@ -40,7 +39,6 @@ from neilfpp_method.train.build import (
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.device import pick_device, waiting
 from neilfpp_method.train.effects_record import write_plan
-from neilfpp_method.train.health_record import health_summary
 from neilfpp_method.train.launch import launch
 from neilfpp_method.train.light_record import light_summary
 from neilfpp_method.train.lock import run_lock
@@ -106,9 +104,9 @@ def run_training(
             training = _train(request, run, prepared, ledger, console)
     if fabric.is_global_zero:
         _finish(run, training, console, at_end)
-    findings = list(training.watch.findings.values())
-    if request.strict and verdict_of(findings) == "failed":
-        raise Unsound(f"{run.out}: {findings[0].what}", findings[0].remedy)
+    health = training.watch.health
+    if request.strict and health.verdict == "failed":
+        raise Unsound(f"{run.out}: {health.findings[0].what}", health.findings[0].remedy)
     return run.out
 
 
@@ -293,8 +291,7 @@ def _finish(
         console.print(f"light: {light_summary(training.config.light, training.fits)}", soft_wrap=True)
     if training.plan.request.base != "as-set":
         console.print(table(training.plan))
-    findings = list(training.watch.findings.values())
-    console.print(f"health: {health_summary(findings)}", soft_wrap=True, markup=False)
+    console.print(f"health: {training.watch.health}", soft_wrap=True, markup=False)
     if at_end is not None:
         at_end(run.out)
     if run.budget is not None:
