@@ -8,7 +8,6 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.material_search import (
     SEARCH_AT,
     SearchedMaterial,
@@ -19,9 +18,6 @@ from neilfpp_method.effects.material_search import (
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.lamp_transport import from_lamps
-from neilfpp_method.lighting.layered_transport import SharedPoints, light_layers, texel_layers
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
@@ -136,24 +132,3 @@ def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():
     for name in ("base_color", "roughness", "metallic"):
         off = (getattr(learned, name) - getattr(material, name)).abs()
         assert off.median() < 0.03, name
-
-
-def test_light_at_several_roughnesses_is_the_transport_times_the_light(places: Places):
-    observed = places.observed[:40]
-    shared = SharedPoints(observed.position, observed.normal, observed, torch.arange(40))
-    model = trained_to(PAINT, places)
-    model.lamps.place(torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 5.0))
-    arguments = (shared, ROUGHNESSES[:3], LOBE, None)
-    torch.manual_seed(0)
-    arriving = light_layers(LightModel(model.light, model.lamps), *arguments)
-    torch.manual_seed(0)
-    transport = texel_layers(model.light, *arguments)
-    radiance = model.light.log_radiance.exp().flatten(1).t()
-    expected = transport.sources.float() @ radiance
-    for number, value in enumerate(ROUGHNESSES[:3]):
-        rough = torch.full((40, 1), value)
-        lamps = from_lamps(model.lamps.lit_places, model.lamps.radius, observed, rough, LOBE, None).sources
-        sent = lamps @ model.lamps.lit_intensity
-        expected[1 + 2 * number : 3 + 2 * number] += sent[1:]
-        expected[0] += sent[0] if number == 0 else 0
-    torch.testing.assert_close(arriving, expected, rtol=1e-4, atol=1e-5)
