@@ -111,7 +111,7 @@ def own_picture(run: Run, name: str, options: Options) -> Picture:
         raise UserError(f"{run.path}: the capture has no view '{name}'", "name one with --camera")
     surface, sky = surface_of_run(run, options.resolution), sky_of_run(run.model.light)
     scene = Scene(surface, run.model.materials, run.model.lobe, sky, lamps_of_run(run.model.lamps))
-    camera = resized(run.capture.normalization.camera(view.camera), options.percent / 100)
+    camera = resized(run.capture.scene_camera(view), options.percent / 100)
     return render_picture(scene, camera, Budget(options.samples), BOUNCES)
 
 

@@ -67,7 +67,7 @@ def known_points(run: Run) -> Known:
     for known in known_test_views(run, rendered).views:
         if known.material is None:
             raise UserError(f"{run.capture.root}: no true materials", "take a capture with ground truth")
-        rays = camera_rays(run.capture.normalization.camera(known.view.camera))
+        rays = camera_rays(run.capture.scene_camera(known.view))
         hits = run.model.host.render(rays)
         rows = torch.nonzero(
             hits.is_hit(run.config.shading.hit_share) & torch.from_numpy(known.mask.reshape(-1))

@@ -105,6 +105,10 @@ class Capture:
         """The test views, in order."""
         return tuple(view for view in self.views if view.name in self.test)
 
+    def scene_camera(self, view: View) -> Camera:
+        """The camera of a view in the scene frame."""
+        return self.normalization.camera(view.camera)
+
     @property
     def summary(self) -> str:
         """The capture in three lines for the console."""

@@ -113,7 +113,7 @@ def _in_view(
     is_chosen: Bool[Tensor, " P"],
 ) -> Places | None:
     """The pixels of one view that show the chosen points; None if none of these lies in the image."""
-    camera = pixels.capture.normalization.camera(pixels.views[number].camera)
+    camera = pixels.capture.scene_camera(pixels.views[number])
     projected = project(camera, points.position)
     column, row = projected.pixel.floor().long().unbind(-1)
     within = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)

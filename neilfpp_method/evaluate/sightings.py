@@ -50,7 +50,7 @@ class TrainingViews:
     def __init__(self, capture: Capture, device: torch.device | str = "cpu") -> None:
         self.hdr = capture.hdr
         self.pixels = PixelDataset(capture, capture.train_views, device)
-        self.cameras = [capture.normalization.camera(view.camera) for view in capture.train_views]
+        self.cameras = [capture.scene_camera(view) for view in capture.train_views]
         self.centers = torch.stack(
             [torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]
         ).to(device)

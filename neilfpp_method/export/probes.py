@@ -73,7 +73,7 @@ def _visible_points(run: Run, device: torch.device) -> Iterator[OrientedPoints]:
     views = run.capture.train_views
     generator = torch.Generator().manual_seed(0)
     for view in views:
-        rays = camera_rays(run.capture.normalization.camera(view.camera))
+        rays = camera_rays(run.capture.scene_camera(view))
         pixels = torch.randperm(len(rays), generator=generator)[: -(-CANDIDATES // len(views))]
         hits = run.model.host.render(rays[pixels].to(device))
         is_hit = hits.is_hit(run.config.shading.hit_share)

@@ -137,7 +137,7 @@ def show_known_light(model: NeilfModel) -> None:
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
-    poses = [capture.normalization.camera(view.camera).c2w for view in capture.train_views]
+    poses = [capture.scene_camera(view).c2w for view in capture.train_views]
     cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
     return VolSdfHost(config, facts, _cloud_points(capture, config), cameras)
 
@@ -172,7 +172,7 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
-    cameras = [capture.normalization.camera(view.camera) for view in capture.train_views]
+    cameras = [capture.scene_camera(view) for view in capture.train_views]
     met = [host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]) for camera in cameras]
     outside = torch.cat([crossings.outside for crossings in met])
     if not len(outside):

@@ -277,7 +277,7 @@ class Session:
     def _add_cameras(self) -> None:
         capture, self.frustums = self.subject.run.capture, []
         for view in capture.views:
-            pose = pose_of(capture.normalization.camera(view.camera))
+            pose = pose_of(capture.scene_camera(view))
             frustum = self.client.scene.add_camera_frustum(
                 f"/cameras/{view.name}",
                 pose.fov,
@@ -303,7 +303,7 @@ class Session:
         view = next((view for view in capture.views if view.name == name), None)
         if view is None:
             return
-        self._move_camera(pose_of(capture.normalization.camera(view.camera)))
+        self._move_camera(pose_of(capture.scene_camera(view)))
         try:
             self.photograph.image, self.photograph.visible = _photograph(view, capture.hdr), True
         # The file may have been removed since the run was loaded; the camera still moves.

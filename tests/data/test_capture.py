@@ -44,7 +44,7 @@ def test_projection_is_k_times_w2c(tmp_path: Path) -> None:
 def test_rays_project_back_to_pixel_centers(tmp_path: Path, frame: str) -> None:
     capture = load_capture(make_capture(tmp_path))
     for view in capture.views:
-        camera = view.camera if frame == "world" else capture.normalization.camera(view.camera)
+        camera = view.camera if frame == "world" else capture.scene_camera(view)
         rays = camera_rays(camera, torch.float64)
         assert torch.allclose(rays.directions.norm(dim=-1), torch.ones((), dtype=torch.float64))
         seen = project(camera, rays.origins + rays.directions * torch.linspace(0.5, 9, len(rays))[:, None])

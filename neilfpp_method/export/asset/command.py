@@ -109,7 +109,7 @@ def export_asset(
             cannot be written.
     """
     full = fine_surface(run, options.resolution)
-    cameras = [run.capture.normalization.camera(view.camera) for view in run.capture.train_views]
+    cameras = [run.capture.scene_camera(view) for view in run.capture.train_views]
     fine = clean(full, visible_faces(full, cameras))
     console.print(f"surface: kept {len(fine.faces)} of {len(full.faces)} triangles, which cameras see")
     coarse = simplified(fine, options.faces, options.error)
