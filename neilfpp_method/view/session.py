@@ -28,7 +28,7 @@ from neilfpp_method.view.cameras import Pose, pinhole, pose_of
 from neilfpp_method.view.incident_map import Point, light_at, light_picture, point_under
 from neilfpp_method.view.pace import Pace
 from neilfpp_method.view.painter import Painter
-from neilfpp_method.view.pictures import Frame, Request, frames
+from neilfpp_method.view.pictures import Frame, PictureRequest, frames
 from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
@@ -182,7 +182,7 @@ class Session:
         camera = self.client.camera
         pose = Pose(camera.position, camera.wxyz, camera.fov, camera.aspect)
         self.painter.request(
-            Request(
+            PictureRequest(
                 subject=self.subject,
                 camera=pinhole(pose, camera.image_width, camera.image_height),
                 layer=KEYS[self.layer.value],

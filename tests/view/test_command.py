@@ -15,7 +15,7 @@ from neilfpp_method.view import command
 from neilfpp_method.view.address import check_free
 
 
-def request(run: Path, port: int, **changes) -> command.Request:
+def request(run: Path, port: int, **changes) -> command.ViewRequest:
     usual = {
         "env": (),
         "env_layout": "ours",
@@ -24,7 +24,7 @@ def request(run: Path, port: int, **changes) -> command.Request:
         "resolution": 32,
         "checkpoint": "last",
     }
-    return command.Request(run=run, port=port, device="cpu", **{**usual, **changes})
+    return command.ViewRequest(run=run, port=port, device="cpu", **{**usual, **changes})
 
 
 def ends(capsys, *words: str) -> str:
