@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.fields.environment import EVEN_ROWS, EnvironmentLight
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_light
+from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, compare, evidence
 from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
-from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.settings.types import MapLightConfig
 
 __all__ = ["solve_light"]
@@ -65,7 +64,7 @@ def solve_light(
         The comparison of the fits with and without lamps; None if the settings decide.
     """
     lamps, target = light.lamps, points.target
-    map_only = _map_start(light.light, points, is_known=config.map is not None)
+    map_only = _map_only(light.light, points, is_known=config.map is not None)
     unknown, no_lamps = map_only.light.log_radiance, map_only.light.intensity
     if config.kind == "distant":
         unknown.copy_(map_only.fit(target, objective).log_radiance)
@@ -75,13 +74,13 @@ def solve_light(
     from_candidates = points.from_lamps(places, lamps.radius)
     intensity = no_lamps.new_zeros(len(places.position), 3)
     intensity[: lamps.count] = lamps.lit_intensity
-    start = _Start(Light(unknown, intensity), map_only.transport.concatenate(from_candidates))
+    start = CarriedLight(MapAndLamps(unknown, intensity), map_only.transport.concatenate(from_candidates))
     measured = None
     if config.kind == "auto":
         compared = _compare_at_held_back_points(map_only, start, target, objective, FOLDS if first else 1)
-        found, measured = compared.found, compared.evidence
+        found, measured = compared.with_lamps, compared.evidence
         if not measured.favours(chosen=lamps_if_undecided or lamps.count > 0):
-            unknown.copy_(compared.plain.log_radiance)
+            unknown.copy_(compared.without_lamps.log_radiance)
             lamps.place(no_lamps, no_lamps)
             return measured
     else:
@@ -92,41 +91,27 @@ def solve_light(
     merged = settle_lamps(merged, lamps.radius, map_light, points, objective)
     # The map was fitted together with the candidates, so it must be fitted again with the refined lamps.
     from_merged = points.from_lamps(merged.places, lamps.radius)
-    refined = _Start(Light(unknown, merged.intensity), map_only.transport.concatenate(from_merged))
+    refined = CarriedLight(
+        MapAndLamps(unknown, merged.intensity), map_only.transport.concatenate(from_merged)
+    )
     found = refined.fit(target, objective)
     unknown.copy_(found.log_radiance)
     lamps.place(merged.places.position, found.intensity, merged.places.axis)
     return measured
 
 
-@dataclass(frozen=True)
-class _Start:
-    """The initial light of a fit, and the transport from its sources to the points."""
-
-    light: Light
-    transport: Transport
-
-    def fit(self, target: Target, objective: Objective) -> Light:
-        """Fit to all points."""
-        return fit_light(self.light, self.transport, target, objective)
-
-    def __getitem__(self, rows: Bool[Tensor, " N"]) -> _Start:
-        """The same light at some of the points."""
-        return _Start(self.light, self.transport[rows])
-
-
-def _map_start(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> _Start:
+def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> CarriedLight:
     """The map without lamps. Its `log_radiance` is a view of the texels to fit, so that `copy_` sets them."""
     no_lamps = environment.log_radiance.new_zeros(0, 3)
     if is_known:
         known = environment.at_most(KNOWN_ROWS)
         from_known = points.from_texels(known).with_strength(known.log_radiance.exp().flatten(1).t())
-        return _Start(Light(environment.log_radiance.new_zeros(3, 0, 0), no_lamps), from_known)
+        return CarriedLight(MapAndLamps(environment.log_radiance.new_zeros(3, 0, 0), no_lamps), from_known)
     if environment.even:
         # An even light is a single source, which is stored in the first texel.
         from_even = points.from_texels(environment.at_most(EVEN_ROWS)).sum_sources()
-        return _Start(Light(environment.log_radiance[:, :1, :1], no_lamps), from_even)
-    return _Start(Light(environment.log_radiance, no_lamps), points.from_texels(environment))
+        return CarriedLight(MapAndLamps(environment.log_radiance[:, :1, :1], no_lamps), from_even)
+    return CarriedLight(MapAndLamps(environment.log_radiance, no_lamps), points.from_texels(environment))
 
 
 @dataclass(frozen=True)
@@ -134,18 +119,18 @@ class _Compared:
     """Two fits to all points but the last fold held back, and the evidence of all folds held back.
 
     Attributes:
-        plain: the fit without lamps.
-        found: the fit with lamps.
+        without_lamps: the last fit without lamps.
+        with_lamps: the last fit with lamps.
         evidence: the comparison of the two at held-back points.
     """
 
-    plain: Light
-    found: Light
+    without_lamps: MapAndLamps
+    with_lamps: MapAndLamps
     evidence: Evidence
 
 
 def _compare_at_held_back_points(
-    map_only: _Start, with_lamps: _Start, target: Target, objective: Objective, folds: int
+    map_only: CarriedLight, with_lamps: CarriedLight, target: Target, objective: Objective, folds: int
 ) -> _Compared:
     """Fit the light with and without lamps, with so many of the `FOLDS` folds held back in turn.
 
@@ -158,8 +143,8 @@ def _compare_at_held_back_points(
         held_back, fitted = fold == number, fold != number
         plain = map_only[fitted].fit(target[fitted], objective)
         found = with_lamps[fitted].fit(target[fitted], objective)
-        transports = (map_only[held_back].transport, with_lamps[held_back].transport)
-        gains.append(compare((plain, found), transports, target[held_back], objective))
+        lights = (map_only[held_back].with_light(plain), with_lamps[held_back].with_light(found))
+        gains.append(compare(*lights, target[held_back], objective))
     return _Compared(plain, found, evidence(torch.cat(gains)))
 
 

@@ -31,13 +31,13 @@ from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
 
-__all__ = ["apply_plan", "review_before_stage", "search_material", "solve_light"]
+__all__ = ["apply_plan", "observe_and_solve", "review_before_stage", "search_material"]
 
 Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
 """Measures with the model after so many steps and adds its decisions to the plan."""
 
 
-def solve_light(run: Training, computed: StepResult, step: int) -> None:
+def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
     """Pass a step to the light solver, which fits the light when that is due.
 
     The first process does this for all.

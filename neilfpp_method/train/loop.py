@@ -39,7 +39,7 @@ from neilfpp_method.train.checkpoint import (
     save_checkpoint,
 )
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.evidence import apply_plan, review_before_stage, search_material, solve_light
+from neilfpp_method.train.evidence import apply_plan, observe_and_solve, review_before_stage, search_material
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.light_record import read_fits, write_fits
@@ -116,7 +116,7 @@ def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: Stag
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
             stop = _update(run, optimizer, computed.terms, total, moment)
-            solve_light(run, computed, step)
+            observe_and_solve(run, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)

@@ -20,7 +20,7 @@ from neilfpp_method.data.views import Camera, Normalization, camera_rays, projec
 from neilfpp_method.fields.encodings import direction_encoding, position_encoding
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces
-from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.fit import MapAndLamps, fit_light
 from neilfpp_method.lighting.lamp_transport import from_lamps
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
@@ -361,7 +361,7 @@ def test_a_light_fit_is_finite_and_not_negative(pixel, firefly, count, seed):
     )
     target = Target(seen.position, made_of, color)
     objective = Objective("linear", max(pixel, 1e-3), steps=20)
-    found = fit_light(Light(sky.log_radiance, torch.zeros(1, 3)), carried, target, objective)
+    found = fit_light(MapAndLamps(sky.log_radiance, torch.zeros(1, 3)), carried, target, objective)
     assert_finite(found.log_radiance, bound=100.0)
     assert_finite(found.intensity, bound=1e18)
     assert found.intensity.min() >= 0
@@ -378,7 +378,7 @@ def test_a_light_fit_follows_the_unit_of_the_images(exponent, seed):
         carried = from_texels(sky, seen, made_of.roughness, GGX, None)
         pixel = unit_of_images * (0.2 + seen.normal[:, 2:].clamp_min(0)).expand(40, 3)
         objective = Objective("linear", 0.5 * unit_of_images, steps=20)
-        start = Light(sky.log_radiance, torch.zeros(0, 3))
+        start = MapAndLamps(sky.log_radiance, torch.zeros(0, 3))
         target = Target(seen.position, made_of, pixel)
         found.append(fit_light(start, carried, target, objective).log_radiance)
     torch.testing.assert_close(found[1], found[0] + exponent * math.log(2), rtol=1e-3, atol=1e-3)

@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.fit import Evidence, Light, fit_light
+from neilfpp_method.lighting.fit import Evidence, MapAndLamps, fit_light
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
 from neilfpp_method.lighting.transport import Transport
@@ -29,7 +29,7 @@ def fit(
     base_color_known: bool = False,
 ) -> None:
     """Set a map by a fit without lamps."""
-    start = Light(environment.log_radiance, torch.zeros(0, 3))
+    start = MapAndLamps(environment.log_radiance, torch.zeros(0, 3))
     objective = Objective("linear", unit, steps, base_color_known)
     found = fit_light(start, carried, target, objective)
     environment.log_radiance.copy_(found.log_radiance)
