@@ -1,3 +1,7 @@
+"""`neilfpp view`: what it serves, and what it refuses in one line."""
+
+from __future__ import annotations
+
 import os
 import shutil
 import socket
