@@ -44,7 +44,7 @@ from neilfpp_method.train.run import Run, load_run
 __all__ = ["blender_picture", "shown_psnr"]
 
 BOUNCES = 6
-ASSET = AssetOptions(texture_size=2048, faces=30_000, error=0.001)
+TEXTURE_SIZE, FACES, ERROR = 2048, 30_000, 0.001
 MAX_SECONDS = 3600
 
 
@@ -111,20 +111,21 @@ def own_picture(run: Run, name: str, options: Options) -> Picture:
         raise UserError(f"{run.path}: the capture has no view '{name}'", "name one with --camera")
     surface, sky = surface_of_run(run, options.resolution), sky_of_run(run.model.light)
     scene = Scene(surface, run.model.materials, run.model.lobe, sky, lamps_of_run(run.model.lamps))
-    camera = resized(run.capture.normalisation.camera(view.camera), options.percent / 100)
+    camera = resized(run.capture.scene_camera(view), options.percent / 100)
     return render_picture(scene, camera, Budget(options.samples), BOUNCES)
 
 
 def compare(options: Options, folder: Path, console: Console) -> None:
     """Export the asset, render it with both programs, and print the comparison."""
     run = load_run(options.run, torch.device("cpu"))
-    check_asset(run, ASSET)
+    asset_options = AssetOptions(options.resolution, TEXTURE_SIZE, FACES, ERROR)
+    check_asset(run, asset_options)
     name = options.camera or run.capture.test_views[0].name
     ours = own_picture(run, name, options)
     radiance = ours.radiance.numpy()
     within = binary_erosion(ours.alpha[..., 0].numpy() == 1)
     asset = folder / "asset"
-    export_asset(run, asset, options.resolution, ASSET, console, progress_bar, None)
+    export_asset(run, asset, asset_options, None, progress_bar, console)
     for source in ("glb", "usd"):
         if not (asset / f"asset.{source}{'a' if source == 'usd' else ''}").is_file():
             continue

@@ -35,10 +35,11 @@ from neilfpp_method.settings.presets import fixed_geometry, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.optimizer import adam, seed_step, set_rates
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import Run, last_checkpoint, load_run
+from neilfpp_method.train.run import Run, load_run
 
 TABLE = "borrowed-host"
 CELLS = 160

@@ -35,7 +35,7 @@ def main() -> int:
         step = step_of(model, stage, RAYS)
 
         def guard(model=model, batch=batch, position=position) -> bool:
-            Moment.before_step(model, batch, position)
+            Moment.before_step(model, batch, position, step=0)
             norms = torch.stack(list(gradient_norms(model).values())).tolist()
             return all(map(math.isfinite, norms))
 

@@ -73,7 +73,7 @@ def _compare_view(run: Run, known: KnownView) -> Compared:
     shown = torch.from_numpy(known.mask).view(-1) & (normal.norm(dim=1) > 0.5)
     rows = torch.nonzero(shown)[:, 0]
     rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:PIXELS]]
-    rays = camera_rays(run.capture.normalisation.camera(known.view.camera))[rows]
+    rays = camera_rays(run.capture.scene_camera(known.view))[rows]
     truth = {name: torch.from_numpy(values).flatten(0, 1)[rows] for name, values in known.material.items()}
     hits = run.model.host.render(RayBatch(rays.origins, rays.directions))
     smooth = run.model.shading_normals(hits.position, hits.normal)

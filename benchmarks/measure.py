@@ -12,7 +12,7 @@ from typing import Literal
 
 import torch
 
-from neilfpp_method.train.environment import processor_name
+from neilfpp_method.train.provenance import processor_name
 
 __all__ = [
     "Measurement",

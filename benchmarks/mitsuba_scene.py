@@ -74,15 +74,15 @@ def render(
     """Linear radiance of a scene under a map in this package's layout, and lamps, 0 where no surface is.
 
     Args:
-        mi: of `load_mitsuba`.
+        mi: Mitsuba, as `load_mitsuba` returns it.
         parts: the surfaces.
-        radiance: the map; Mitsuba's rows are at the poles, too.
-        camera: a pinhole with the principal point in the middle.
-        folder: where meshes and map are put down.
-        samples: of a pixel.
-        bounces: surfaces on a path, at most.
-        seed: of the samples.
-        lamps: before the map.
+        radiance: the map, whose first and last rows are at the poles, as in Mitsuba.
+        camera: a pinhole camera with its principal point in the middle of the image.
+        folder: folder for the files of the meshes.
+        samples: samples per pixel.
+        bounces: maximum number of surfaces on a path.
+        seed: seed of the samples.
+        lamps: lamps in addition to the map.
     """
     transform = mi.ScalarTransform4f
     pose = np.eye(4)

@@ -90,7 +90,7 @@ def true_materials(capture: Capture) -> Materials:
         depth, material = truth.depth(view), truth.material(view)
         if depth is None or material is None:
             raise UserError(f"{capture.root}: no true materials", "take a capture with ground truth")
-        camera = capture.normalisation.camera(view.camera)
+        camera = capture.scene_camera(view)
         rays, shown = camera_rays(camera), depth > 0
         along = rays.directions @ torch.as_tensor(camera.w2c[2, :3], dtype=torch.float32)
         places.append((rays.origins + rays.directions * (depth / along)[:, None])[shown])
@@ -156,7 +156,7 @@ def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
     capture = load_capture(options.capture)
     views, files = capture.test_views, find_truth(options.under / "images", capture.test_views)
     truths = [read_truth(capture, view, files[view.name]) for view in views]
-    cameras = [capture.normalisation.camera(view.camera) for view in views]
+    cameras = [capture.scene_camera(view) for view in views]
     rows: list[Row] = []
     for name, scene in scenes(options, capture):
         pictures = []

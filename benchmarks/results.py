@@ -34,18 +34,12 @@ from neilfpp_method.schedule import Stage, stage_steps
 from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
+from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint, load_checkpoint, save_checkpoint
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import (
-    create_run,
-    last_checkpoint,
-    load_checkpoint,
-    load_run,
-    read_description,
-    save_checkpoint,
-)
+from neilfpp_method.train.run import create_run, load_run, read_description
 
 STAGES = {"material_init": "material stage", "joint": "joint stage"}
 TABLES = {"volsdf": "found-geometry", "mesh": "given-geometry"}
@@ -128,7 +122,7 @@ def train(
 def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
     """Create a run at the end of SDF init with the host of the trunk, and an untrained material and light."""
     described = read_description(trunk)
-    saved = load_checkpoint(trunk / "checkpoints" / "sdf_init.pt")
+    saved = load_checkpoint(checkpoint_path(trunk, "sdf_init"))
     seed_step(config.train.seed, step=-1)
     model = build_model(described.source.load(), described.facts, config)
     own = model.state_dict()

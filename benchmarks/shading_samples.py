@@ -33,7 +33,14 @@ from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import Technique, combine, cosine, sample_directions, specular_lobe
+from neilfpp_method.shading.sampling import (
+    Sampling,
+    Technique,
+    combine,
+    cosine,
+    sample_directions,
+    specular_lobe,
+)
 from neilfpp_method.structures import Incident, IncidentSamples, Material
 
 __all__ = ["Scene", "error_curves", "measurements", "scene_of", "techniques"]
@@ -111,20 +118,17 @@ def techniques() -> dict[str, Draw]:
 
     def plain(kind: str) -> Draw:
         return lambda scene, roughness, count: sample_directions(
-            kind,
+            Sampling(kind, count, LOBE, stochastic=True),
             scene.normal,
             scene.wo,
             torch.full_like(scene.material.roughness, roughness),
-            count,
-            LOBE,
-            stochastic=True,
         )
 
     def with_light(scene: Scene, roughness: float, count: int) -> IncidentSamples:
         even = torch.full_like(scene.material.roughness, roughness)
         light = scene.to_light()
         return sample_directions(
-            "mis", scene.normal, scene.wo, even, count, LOBE, stochastic=True, light=light
+            Sampling("mis", count, LOBE, stochastic=True), scene.normal, scene.wo, even, light
         )
 
     return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | {

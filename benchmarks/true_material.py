@@ -26,6 +26,7 @@ from neilfpp_method.evaluate.scene_metrics import light_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.structures import Material, Observed
@@ -66,7 +67,7 @@ def known_points(run: Run) -> Known:
     for known in known_test_views(run, rendered).views:
         if known.material is None:
             raise UserError(f"{run.capture.root}: no true materials", "take a capture with ground truth")
-        rays = camera_rays(run.capture.normalisation.camera(known.view.camera))
+        rays = camera_rays(run.capture.scene_camera(known.view))
         hits = run.model.host.render(rays)
         rows = torch.nonzero(
             hits.is_hit(run.config.shading.hit_share) & torch.from_numpy(known.mask.reshape(-1))
@@ -90,8 +91,8 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     )
     for _ in range(fits):
         rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
-        seen, material = known.seen[rows], known.material[rows]
-        solve_light(light, seen, material, model.lobe, model.scene, objective, settings, first=False)
+        points = FitPoints(known.seen[rows], known.material[rows], model.lobe, model.scene)
+        solve_light(light, points, objective, settings, first=False)
 
 
 def line(run: Run, title: str) -> str:
@@ -106,7 +107,7 @@ def line(run: Run, title: str) -> str:
     )
     lamps = run.model.lamps
     for k in range(lamps.count):
-        place = run.capture.normalisation.to_world(lamps.position[k]).tolist()
+        place = run.capture.normalization.to_world(lamps.position[k]).tolist()
         text += "\n" + 24 * " " + "lamp at " + ", ".join(f"{x:.2f}" for x in place)
         text += "; axis " + ", ".join(f"{x:.2f}" for x in lamps.axis[k].tolist())
         text += "; intensity " + ", ".join(f"{x:.2f}" for x in lamps.intensity[k].tolist())

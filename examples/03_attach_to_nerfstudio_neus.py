@@ -34,7 +34,7 @@ trained = [p for group in neus.get_param_groups().values() for p in group if p.r
 optimizer = torch.optim.Adam(trained, 5e-4)
 own = NerfstudioHost(neus, response="linear")
 for _ in range(STEPS):
-    rendered = own.render_regularised(batch := pixels.sample(RAYS), {"eikonal"})
+    rendered = own.render_regularized(batch := pixels.sample(RAYS), {"eikonal"})
     loss = (rendered.hits.color - batch.color).abs().mean() + 0.1 * rendered.terms["eikonal"].mean()
     optimizer.zero_grad()
     loss.backward()

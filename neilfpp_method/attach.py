@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from neilfpp_method.hosts.batches import check_batch, check_like, check_points, 
 from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.first_batches import FirstBatches
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
+from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
@@ -149,7 +150,7 @@ class AttachedNeilf(nn.Module):
             on_object = hits[torch.nonzero(batch.mask > 0.5)[:, 0]]
             measured = measure_hits(self.model, on_object, self._with_material)
             self.watch.judge(measured, self.step_guard.skipped, self._steps)
-        return Health.of(self.watch.findings.values())
+        return self.watch.health
 
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
         """Render all maps of a view, one row per ray: material, shading, normal, depth (`structures.Maps`).
@@ -171,15 +172,16 @@ class AttachedNeilf(nn.Module):
                 raise UserError(
                     f"{host_name(self.model.host)} takes rays", "give data.views.camera_rays(camera)"
                 )
+            camera, rays = rays, rays_like(rays, next(self.model.brdf.parameters()))
             with torch.no_grad():
-                rays, hits = self.model.host.image_hits(rays, next(self.model.brdf.parameters()))
+                hits = self.model.host.image_hits(camera, rays)
         self._check_device_and_dtype("rays", rays.origins)
         rendered = self._host_hits(rays, hits, moves_host=False)
         if rendered is None:
             return self.model.maps(rays)
         starts = range(0, max(len(rays), 1), EVAL_RAYS)
         parts = [self.model.maps(rays[i : i + EVAL_RAYS], hits=rendered[i : i + EVAL_RAYS]) for i in starts]
-        return Maps(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Maps)))
+        return Maps.joined(parts)
 
     def param_groups(self) -> list[dict[str, Any]]:
         """Groups for `optimizer.add_param_group`, one per field, with the learning rates of the settings.
@@ -360,7 +362,7 @@ def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:
 
 def _cloned(rays: RayBatch) -> RayBatch:
     """Copies of rays that are not inference tensors, so that a host may compute gradients with them."""
-    return RayBatch(rays.origins.clone(), rays.directions.clone())
+    return rays.map(torch.Tensor.clone)
 
 
 def _inner(host: object) -> object:

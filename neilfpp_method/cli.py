@@ -123,7 +123,8 @@ def _parse(name: str, command: Command, arguments: Sequence[str]) -> Any:
         # Without a complaint, tyro has printed the help.
         if not complaint.getvalue():
             raise
-        what, meant = mistake(complaint.getvalue(), arguments)
+        found = mistake(complaint.getvalue(), arguments)
+        what, meant = found.what, found.meant
         folder = next(iter(arguments), "-")
         if what == f"{TYRO_UNKNOWN} {folder}" and folder[:1] != "-" and "data" in _names(command):
             meant = f"--data {folder}"

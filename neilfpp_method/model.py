@@ -15,12 +15,11 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
-from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularised, SmoothsNormals
+from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import (
     Sources,
     arriving,
-    draw_directions,
     incident_radiance,
     scene_tracer,
     trace_light,
@@ -31,7 +30,7 @@ from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, Sta
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.facts import SceneFacts, radiance_units
 from neilfpp_method.settings.types import NeilfConfig, ShadingConfig
-from neilfpp_method.shading import LOBES, Lobe, initial_albedo, shade
+from neilfpp_method.shading import LOBES, Lobe, Sampling, initial_albedo, sample_directions, shade
 from neilfpp_method.structures import (
     Incident,
     LossTerm,
@@ -199,9 +198,9 @@ class NeilfModel(nn.Module):
         with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
             if hits is not None:
                 hits, terms = hits if torch.is_grad_enabled() else hits.detach(), {}
-            elif isinstance(self.host, Regularised):
-                regularised = self.host.render_regularised(batch, active)
-                hits, terms = regularised.hits, dict(regularised.terms)
+            elif isinstance(self.host, Regularized):
+                regularized = self.host.render_regularized(batch, active)
+                hits, terms = regularized.hits, dict(regularized.terms)
             else:
                 hits, terms = self.host.render(batch.rays), {}
             self.check_outputs(batch.rays, hits, color_moves="volume" in active and torch.is_grad_enabled())
@@ -267,8 +266,9 @@ class NeilfModel(nn.Module):
         samples: int,
     ) -> Incident:
         """Incident light along `samples` directions per point; no gradient flows through their choice."""
-        n, roughness, sampler = normal.detach(), material.roughness.detach(), self.config.shading.sampler
-        drawn = draw_directions(sampler, self.light, n, wo, roughness, samples, self.lobe, self.training)
+        sampling = Sampling(self.config.shading.sampler, samples, self.lobe, stochastic=self.training)
+        n, roughness = normal.detach(), material.roughness.detach()
+        drawn = sample_directions(sampling, n, wo, roughness, self.light.technique(n))
         return arriving(self.sources, position, drawn)
 
     @timed("tracing")

@@ -7,10 +7,10 @@ frame, and radiance is linear RGB.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -53,18 +53,33 @@ class Indexable:
     is the number of rows.
     """
 
-    def _map(self: Structure, function) -> Structure:
+    @staticmethod
+    def joined(parts: Sequence[Structure]) -> Structure:
+        """The rows of all parts, of which there is at least one, in order."""
+        first, *others = parts
+        return first.map_named(
+            lambda name, rows: torch.cat([rows, *(getattr(other, name) for other in others)])
+        )
+
+    def map_named(self: Structure, function: Callable[[str, Tensor], Tensor]) -> Structure:
+        """Replace every tensor by `function(name, tensor)`."""
         tensors = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: function(t) for name, t in tensors.items() if isinstance(t, Tensor)})
+        return replace(
+            self, **{name: function(name, t) for name, t in tensors.items() if isinstance(t, Tensor)}
+        )
+
+    def map(self: Structure, function: Callable[[Tensor], Tensor]) -> Structure:
+        """Replace every tensor by `function(tensor)`."""
+        return self.map_named(lambda name, tensor: function(tensor))
 
     def __getitem__(self: Structure, rows: Tensor | slice) -> Structure:
-        return self._map(lambda t: t[rows])
+        return self.map(lambda t: t[rows])
 
     def to(self: Structure, device: torch.device | str) -> Structure:
-        return self._map(lambda t: t.to(device, non_blocking=True))
+        return self.map(lambda t: t.to(device, non_blocking=True))
 
     def detach(self: Structure) -> Structure:
-        return self._map(Tensor.detach)
+        return self.map(Tensor.detach)
 
     def __len__(self) -> int:
         return getattr(self, fields(self)[0].name).shape[0]
@@ -90,7 +105,7 @@ class PixelBatch(Indexable):
         mask_known: 1 everywhere if the capture has masks. Without masks it is 1 only at pixels that show
             exactly the background colour; all other pixels have `mask` 1.
         image_gradient: length of the gradient of the image's luminance by Scharr's filter without
-            normalisation, that is 32 times the change per pixel; 0 if no loss needs it.
+            normalization, that is 32 times the change per pixel; 0 if no loss needs it.
         view: index of the training view.
     """
 
@@ -266,10 +281,22 @@ class Observed(Indexable):
     `wo` points towards the camera; `pixel` is the pixel value in the capture's response (linear or sRGB).
     """
 
+    WIDTH: ClassVar[int] = 12
+    """Numbers per point in `rows`."""
+
     position: Float[Tensor, "N 3"]
     normal: Float[Tensor, "N 3"]
     wo: Float[Tensor, "N 3"]
     pixel: Float[Tensor, "N 3"]
+
+    @staticmethod
+    def of_rows(rows: Float[Tensor, "N 12"]) -> Observed:
+        """The points that `rows` packed."""
+        return Observed(*rows.split(3, -1))
+
+    def rows(self) -> Float[Tensor, "N 12"]:
+        """Position, normal, wo and pixel of each point, packed into a row."""
+        return torch.cat((self.position, self.normal, self.wo, self.pixel), -1)
 
 
 @dataclass(frozen=True)
@@ -293,8 +320,8 @@ class StepResult(NamedTuple):
 
     Attributes:
         terms: the active losses of the stage, before their weights.
-        surface_rows: position, normal, wo and pixel of the surface points that this step rendered; no rows
-            in a stage without material.
+        surface_rows: the surface points that this step rendered (`Observed.rows`); no rows in a stage without
+            material.
         background_rows: direction and pixel of the rays that miss the scene; no rows in a stage without
             material.
     """
@@ -306,18 +333,17 @@ class StepResult(NamedTuple):
     @staticmethod
     def of(terms: LossTerms, surface: Observed, background: PixelBatch) -> StepResult:
         """Pack loss terms, rendered surface points, and pixels whose rays miss the scene."""
-        points = (surface.position, surface.normal, surface.wo, surface.pixel)
-        pixels = (background.directions, background.color)
-        return StepResult(terms, torch.cat(points, -1).detach(), torch.cat(pixels, -1))
+        background_rows = torch.cat((background.directions, background.color), -1)
+        return StepResult(terms, surface.rows().detach(), background_rows)
 
     @property
     def surface(self) -> Observed:
         """The surface points that this step rendered, with their shading normals."""
-        return Observed(*self.surface_rows.split(3, -1))
+        return Observed.of_rows(self.surface_rows)
 
 
 @dataclass(frozen=True)
-class Maps:
+class Maps(Indexable):
     """All maps of an image, one row per ray; colours are linear RGB.
 
     Attributes:

@@ -21,7 +21,7 @@ SOURCES = {
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("errors", "structures", "timing"),
     ("settings",),
-    ("kernels", "lighting.ring"),
+    ("kernels",),
     ("shading", "volume", "schedule"),
     ("fields", "data", "losses", "settings.facts"),
     ("hosts.base", "lighting", "inspection"),

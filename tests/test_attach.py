@@ -245,7 +245,7 @@ def test_missing_capabilities_are_logged_once_in_one_line(caplog):
         neilf = attach_neilf(Ball(), tiny_config())
         neilf.losses(pixels(), Stage.MATERIAL_INIT)
     (record,) = caplog.records
-    lacking = {"render_regularised", "surface_width", "parameter_groups", "sdf", "scene_light"}
+    lacking = {"render_regularized", "surface_width", "parameter_groups", "sdf", "scene_light"}
     assert set(neilf.missing) == lacking
     assert "attached to Ball" in record.message
     assert all(f"no {name}: {neilf.missing[name]}" in record.message for name in lacking)

@@ -175,7 +175,7 @@ class AutogradNormals(Ball):
         return color, position, torch.where(normal.norm(dim=-1, keepdim=True) > 0.5, slope, 0.0)
 
 
-def test_inference_mode():
+def test_maps_render_in_inference_mode():
     """Maps can be rendered in it although hosts need autograd; what is attached in it can be trained."""
     host, rays = AutogradNormals(), ball_rays(16)
     with torch.inference_mode():
@@ -214,7 +214,7 @@ def test_a_checkpoint_of_another_precision_is_read():
     fresh = attach_neilf(Ball().double(), solved_light(tiny_config())).double()
     fresh.load_state_dict(state)
     assert fresh.proxy._pending
-    assert {rays.origins.dtype for rays, _ in fresh.proxy._pending} == {torch.float64}
+    assert {pending.rays.origins.dtype for pending in fresh.proxy._pending} == {torch.float64}
     fresh.proxy.refresh()
 
 

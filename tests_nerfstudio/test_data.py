@@ -229,7 +229,7 @@ def test_a_colmap_model_converted_by_nerfstudio_is_read(tmp_path: Path, model: s
         )
     assert theirs.scene_from == "points"  # from sparse_pc.ply, in the rotated frame
     np.testing.assert_allclose(
-        theirs.normalisation.center, applied[:, :3] @ first.normalisation.center, atol=0.1
+        theirs.normalization.center, applied[:, :3] @ first.normalization.center, atol=0.1
     )
 
 

@@ -14,7 +14,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import nn
 from torch.nn.functional import normalize
 
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts import proxy
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
@@ -92,7 +92,7 @@ def rays() -> RayBatch:
 @pytest.mark.parametrize("kind", [Ball, ColorCodedBall])
 def test_hits_are_in_the_scene_frame(kind: type[Model]) -> None:
     # In the scene frame the ball is the sphere of radius RADIUS / 3 about the origin.
-    host = NerfstudioHost(ball(kind), frame=Normalisation(3.0, tuple(CENTER.tolist())))
+    host = NerfstudioHost(ball(kind), frame=Normalization(3.0, tuple(CENTER.tolist())))
     hits = host.render(rays())
     hit = slice(0, 3)
     torch.testing.assert_close(hits.position[hit].norm(dim=-1), torch.full((3,), RADIUS / 3.0))
@@ -168,14 +168,14 @@ def test_own_losses_are_computed_if_the_host_is_trained(name: str, own: str) -> 
     torch.manual_seed(0)
     host = NerfstudioHost(build_foreign(name, ARGUMENTS).model, own_losses=True).train()
     batch = sphere_batch(8)
-    term = host.render_regularised(batch, {"volume"}).terms["own"].mean()
+    term = host.render_regularized(batch, {"volume"}).terms["own"].mean()
     term.backward()
     assert term.isfinite()
     assert term > 0.0, own
     assert any(p.grad is not None and p.grad.any() for p in host.parameters())
     with torch.no_grad():
-        assert not host.render_regularised(batch, {"volume"}).terms
-    assert not host.eval().render_regularised(batch, {"volume"}).terms
+        assert not host.render_regularized(batch, {"volume"}).terms
+    assert not host.eval().render_regularized(batch, {"volume"}).terms
 
 
 def test_the_weight_of_a_hosts_own_losses_is_a_setting(tmp_path: Path) -> None:

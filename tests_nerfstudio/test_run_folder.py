@@ -13,8 +13,9 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.plugin.model import NeilfMethod
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from neilfpp_method.train.health_record import read_findings
-from neilfpp_method.train.run import load_checkpoint, load_run, run_folder
+from neilfpp_method.train.run import load_run, run_folder
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences
 from tests_nerfstudio.runs import ns_train, small_settings, trainer_config, weights
@@ -54,9 +55,9 @@ def test_a_training_begun_in_nerfstudio_is_continued_outside(data: Path, run: Pa
     config = trainer_config(data, tmp_path, small_settings())
     config.max_num_iterations = 6
     first = ns_train(config) / "neilfpp"
-    assert load_checkpoint(first / "checkpoints" / "last.pt")["step"] == 6
+    assert load_checkpoint(last_checkpoint(first))["step"] == 6
     assert main(["train", "--out", str(first), "--resume", "--no-report"]) == 0
-    continued = load_checkpoint(first / "checkpoints" / "last.pt")["model"]
+    continued = load_checkpoint(last_checkpoint(first))["model"]
     assert differences(weights(run), continued) == []
 
 

@@ -346,14 +346,14 @@ MUTANTS: Sequence[Mutant] = (
     # Checkpoints.
     Mutant(
         "checkpoints may run code",
-        "train/run.py",
+        "train/checkpoint.py",
         'map_location="cpu", weights_only=True)',
         'map_location="cpu", weights_only=False)',
         "train/test_checkpoint.py",
     ),
     Mutant(
         "checkpoints are written in place",
-        "train/run.py",
+        "train/checkpoint.py",
         'with replacing(path) as temporary, temporary.open("wb") as file:',
         'with path.open("wb") as file:',
         "train/test_checkpoint.py",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
+from rich.console import Console
 
 from neilfpp_method.commands.command import Checkpoint, Command, Device, progress_bar, terminal
 
@@ -79,9 +81,7 @@ def _published(options: Eval) -> None:
     console.print(
         f"protocol {protocol.name}, as {protocol.source}; not computed: {protocol.left_out}", soft_wrap=True
     )
-    for name, value in figures.items():
-        console.print(f"{name:36} {value:8.3f}")
-    console.print(f"written to {out}", soft_wrap=True)
+    _print(figures, out, console)
 
 
 def _own(options: Eval) -> None:
@@ -103,7 +103,11 @@ def _own(options: Eval) -> None:
     with computing_fast(), progress_bar("evaluating") as advance:
         metrics = evaluate(run, advance)
     write_metrics(out, run, metrics)
-    for name, value in metrics.items():
+    _print(metrics, out, console)
+
+
+def _print(figures: Mapping[str, float], out: Path, console: Console) -> None:
+    for name, value in figures.items():
         console.print(f"{name:36} {value:8.3f}")
     console.print(f"written to {out}", soft_wrap=True)
 

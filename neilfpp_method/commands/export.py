@@ -46,23 +46,21 @@ class Export:
 def run(options: Export) -> None:
     from neilfpp_method.evaluate.confidence import deviations_at
     from neilfpp_method.export.asset.command import AssetOptions
-    from neilfpp_method.export.command import run_export
+    from neilfpp_method.export.command import ExportRequest, run_export
     from neilfpp_method.kernels.process import computing_fast
 
+    request = ExportRequest(
+        run=options.run,
+        out=options.out,
+        what=options.what,
+        probes=options.probes,
+        asset=AssetOptions(options.resolution, options.texture_size, options.faces, options.error),
+        deviations=deviations_at if options.confidence else None,
+        checkpoint=options.checkpoint,
+        device=options.device,
+    )
     with computing_fast():
-        run_export(
-            run=options.run,
-            what=options.what,
-            out=options.out,
-            resolution=options.resolution,
-            probes=options.probes,
-            asset=AssetOptions(options.texture_size, options.faces, options.error),
-            deviations=deviations_at if options.confidence else None,
-            bar=progress_bar,
-            checkpoint=options.checkpoint,
-            device=options.device,
-            console=terminal(),
-        )
+        run_export(request, progress_bar, terminal())
 
 
 COMMAND = Command(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from difflib import get_close_matches
 from itertools import pairwise
 
-__all__ = ["TYRO_UNKNOWN", "closest", "mistake"]
+__all__ = ["TYRO_UNKNOWN", "Mistake", "closest", "mistake"]
 
 TYRO_SUGGESTS = "Perhaps you meant"
 """Heading of the options that tyro suggests."""
@@ -28,15 +29,20 @@ def closest(word: str, words: Iterable[str]) -> str | None:
     return next(iter(get_close_matches(word, list(words), n=1, cutoff=0.7)), None)
 
 
-def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
-    """Extract the message from tyro's error output, and the option that was probably meant.
+@dataclass(frozen=True)
+class Mistake:
+    """What is wrong with a command line, and the option that was probably meant; None if there is none."""
+
+    what: str
+    meant: str | None
+
+
+def mistake(complaint: str, arguments: Sequence[str]) -> Mistake:
+    """Find the mistake that tyro's error output describes.
 
     Args:
         complaint: the box that tyro prints; its paragraphs are separated by rules.
         arguments: the words of the command line.
-
-    Returns:
-        The message, and the suggested option; the latter is None if there is none.
     """
     boxed = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")]
     lines = boxed or complaint.splitlines()
@@ -48,8 +54,8 @@ def mistake(complaint: str, arguments: Sequence[str]) -> tuple[str, str | None]:
             paragraphs.append([])
     what = " ".join(paragraphs[0]).rstrip(".")
     if what.startswith(TYRO_MISSING):
-        return _missing(complaint) or what, None
-    return what, _flag_with_a_value(what, arguments) or _suggested(what, paragraphs)
+        return Mistake(_missing(complaint) or what, None)
+    return Mistake(what, _flag_with_a_value(what, arguments) or _suggested(what, paragraphs))
 
 
 def _missing(complaint: str) -> str:

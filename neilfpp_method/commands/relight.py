@@ -80,12 +80,12 @@ class Relight:
 
 def run(options: Relight) -> None:
     from neilfpp_method.kernels.process import computing_fast
-    from neilfpp_method.relight.command import Request, relight
+    from neilfpp_method.relight.command import RelightRequest, relight
 
     console = terminal()
     messages: list[str] = []
     with computing_fast(), progress_bar("relighting") as advance:
-        out = relight(Request(**vars(options)), messages.append, advance)
+        out = relight(RelightRequest(**vars(options)), messages.append, advance)
     for line in (*messages, f"written to {out}"):
         console.print(line, soft_wrap=True)
 

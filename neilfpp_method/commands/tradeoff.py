@@ -41,14 +41,16 @@ def run(options: Tradeoff) -> None:
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.settings.presets import fixed_geometry, preset
     from neilfpp_method.tradeoff.command import run_tradeoff
+    from neilfpp_method.tradeoff.rows import TradeoffRequest
 
     config = preset(options.preset)
     config = fixed_geometry(config) if options.host == "mesh" else config
     budgets = [read_duration(word) for word in options.budgets.split(",") if word.strip()]
     out = options.out or Path("runs") / f"{options.data.resolve().name}-{config.preset}-tradeoff"
     at_end = (lambda path: after_training(path, options.device)) if options.report else None
+    request = TradeoffRequest(options.data, out, config, budgets, options.seeds, options.device)
     with computing_fast():
-        run_tradeoff(options.data, out, config, budgets, options.seeds, options.device, terminal(), at_end)
+        run_tradeoff(request, terminal(), at_end)
 
 
 COMMAND = Command(

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from neilfpp_method.commands.command import Command, Device, terminal
 from neilfpp_method.commands.report import after_training
-from neilfpp_method.errors import UserError
-from neilfpp_method.settings.files import read_settings
-from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
-from neilfpp_method.settings.types import MapLightConfig, MeshConfig, NeilfConfig
+from neilfpp_method.commands.train_settings import DEFAULT_PRESET, base_settings, with_files
+from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["COMMAND"]
-
-DEFAULT_PRESET = "fast"
-"""Preset if neither --preset nor a settings file names one."""
-ROOMS_WITH_KINDS = ("light", "encoding")
-"""Groups of settings whose members depend on their `kind`. The kind of the host is the option --host."""
 
 
 @dataclass
@@ -93,15 +85,14 @@ def run(options: TrainWithSettings) -> None:
     from neilfpp_method.train.request import TrainingRequest
 
     budget = None if options.budget is None else read_duration(options.budget)
-    config = _with_files(options)
+    config = with_files(options.config, options.mesh, options.light)
     named = options.preset is not None or options.config_file is not None
     as_before = options.resume and not named and config == preset(DEFAULT_PRESET)
-    published = config.preset.startswith("paper-")
-    effects = (
-        None
-        if options.resume and options.effects is None
-        else parse_effects(options.effects or ("as-set" if published else "auto"))
-    )
+    if options.resume and options.effects is None:
+        effects = None
+    else:
+        published = config.preset.startswith("paper-")
+        effects = parse_effects(options.effects or ("as-set" if published else "auto"))
     with computing_fast(), _viewer(options, config):
         request = TrainingRequest(
             data=options.data,
@@ -138,79 +129,6 @@ def _viewer(options: TrainWithSettings, config: NeilfConfig) -> AbstractContextM
     )
 
 
-def _with_files(options: TrainWithSettings) -> NeilfConfig:
-    """The settings with the files of --mesh and --light."""
-    config = options.config
-    if options.mesh is not None:
-        if not isinstance(config.host, MeshConfig):
-            raise UserError(
-                f"--mesh {options.mesh}: the host {config.host.kind} takes no mesh", "add --host mesh"
-            )
-        config = changed(config, {"host.path": str(options.mesh.resolve())})
-    if options.light is not None:
-        if not isinstance(config.light, MapLightConfig):
-            raise UserError(
-                f"{options.light}: a light that is free at every point takes no map",
-                "add --config.light.kind distant, or auto to look for near lamps as well",
-            )
-        config = changed(config, {"light.map": str(options.light.resolve())})
-    return config
-
-
-def _starting_point(arguments: Sequence[str]) -> TrainWithSettings:
-    """Default options for a command line.
-
-    The settings file, the preset, the host, and the kinds of light and encoding are read before all other
-    options, because they determine which settings exist and what their defaults are.
-    """
-    file = _option(arguments, "--config")
-    stored = dict(read_settings(Path(file))) if file is not None else {}
-    where = file or "config"
-    host = _option(arguments, "--host")
-    config = _base(_option(arguments, "--preset"), host, stored, where)
-    config = changed(config, stored, where)
-    if host is not None and host != config.host.kind:
-        raise UserError(
-            f"{where}: its host is {config.host.kind}, but --host is {host}", "leave one of them out"
-        )
-    kinds = {room: _option(arguments, f"--config.{room}.kind") for room in ROOMS_WITH_KINDS}
-    changes = {f"{room}.kind": kind for room, kind in kinds.items() if kind is not None}
-    if kinds["light"] == "free" and config.light.kind != "free":
-        config = free_light(config)
-    return TrainWithSettings(config=changed(config, changes, "--config"))
-
-
-def _base(name: str | None, host: str | None, stored: Mapping[str, Any], where: str) -> NeilfConfig:
-    """The preset to which a settings file is applied: that of --preset, of the file, or the default."""
-    label = stored.get("preset", DEFAULT_PRESET) if name is None else name
-    kind = stored.get("host", {})
-    mesh = (
-        host == "mesh"
-        or (isinstance(kind, Mapping) and kind.get("kind") == "mesh")
-        or stored.get("host.kind") == "mesh"
-    )
-    if not isinstance(label, str):
-        raise UserError(f"{where}.preset: {label!r} is not a name", f"choose one of {', '.join(PRESETS)}")
-    label = label.removesuffix("-mesh") if name is None else label
-    # Settings that no preset made carry the label of the default settings.
-    config = NeilfConfig() if name is None and label == NeilfConfig().preset else preset(label)
-    config = fixed_geometry(config) if mesh else config
-    light = stored.get("light", {})
-    free = isinstance(light, Mapping) and light.get("kind") == "free" and config.light.kind != "free"
-    return free_light(config) if free else config
-
-
-def _option(arguments: Sequence[str], name: str) -> str | None:
-    """The value of an option in a command line; the last one if it occurs several times."""
-    value = None
-    for i, argument in enumerate(arguments):
-        if argument == name and i + 1 < len(arguments):
-            value = arguments[i + 1]
-        if argument.startswith(f"{name}="):
-            value = argument.split("=", 1)[1]
-    return value
-
-
 COMMAND = Command(
     TrainWithSettings,
     run,
@@ -223,6 +141,6 @@ COMMAND = Command(
         "neilfpp train --out runs/teapot --resume",
         "neilfpp train --data captures/teapot --effects auto,-lamps   (without lamps)",
     ],
-    _starting_point,
+    lambda words: TrainWithSettings(config=base_settings(words)),
     usual=Train,
 )

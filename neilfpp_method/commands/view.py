@@ -39,10 +39,10 @@ class View:
 
 def run(options: View) -> None:
     from neilfpp_method.kernels.process import computing_fast
-    from neilfpp_method.view.command import Request, view
+    from neilfpp_method.view.command import ViewRequest, view
 
     with computing_fast():
-        view(Request(**vars(options)), lambda text: terminal().print(text, soft_wrap=True))
+        view(ViewRequest(**vars(options)), lambda text: terminal().print(text, soft_wrap=True))
 
 
 COMMAND = Command(

@@ -83,7 +83,7 @@ def same_cameras(one: Capture, other: Capture) -> bool:
     """Whether two captures share views, by name, whose cameras agree except for the size of the image."""
     by_name = {view.name: view for view in other.views}
     pairs = [(view, by_name[view.name]) for view in one.views if view.name in by_name]
-    units = 1 / one.normalisation.scale, 1 / other.normalisation.scale
+    units = 1 / one.normalization.scale, 1 / other.normalization.scale
     return bool(pairs) and all(_same_camera(a, b, units) for a, b in pairs)
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.files import Files, read_files
-from neilfpp_method.train.run import CaptureSource, last_checkpoint, load_checkpoint, read_description
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
+from neilfpp_method.train.run import CaptureSource, read_description
 
 __all__ = ["Contender", "labels_of", "read_contenders"]
 

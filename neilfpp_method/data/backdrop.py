@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float64
 
 from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.structures import RayBatch
 
 __all__ = ["MAX_RAYS", "leaves_room"]
@@ -30,19 +30,19 @@ MIN_INSIDE_SHARE = 0.9
 """Share of the rays that must have a test point inside the visual hull."""
 
 
-def leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalisation: Normalisation) -> bool:
+def leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalization: Normalization) -> bool:
     """Return whether the pixels that do not have the background colour can lie within the scene.
 
     Args:
         outlines: for each view, the pixels without that colour; cameras in the world frame.
         rays: rays through such pixels, in the scene frame.
-        normalisation: the transformation between the two frames.
+        normalization: the transformation between the two frames.
     """
-    held = agreement(outlines, _places(rays, normalisation)).reshape(len(rays), PLACES)
+    held = agreement(outlines, _places(rays, normalization)).reshape(len(rays), PLACES)
     return bool((held >= AGREEMENT).any(axis=1).mean() >= MIN_INSIDE_SHARE)
 
 
-def _places(rays: RayBatch, normalisation: Normalisation) -> Float64[np.ndarray, "P 3"]:
+def _places(rays: RayBatch, normalization: Normalization) -> Float64[np.ndarray, "P 3"]:
     """Test points on each ray, world frame; the closest point of a ray that misses the sphere."""
     origins, directions = rays.origins.double().cpu(), rays.directions.double().cpu()
     nearest = -(origins * directions).sum(-1, keepdim=True)
@@ -50,4 +50,4 @@ def _places(rays: RayBatch, normalisation: Normalisation) -> Float64[np.ndarray,
     half = (RADIUS**2 - missed).clamp_min(0.0).sqrt()
     along = nearest + half * torch.linspace(-1.0, 1.0, PLACES, dtype=half.dtype)
     points = origins[:, None] + along[..., None] * directions[:, None]
-    return normalisation.to_world(points.reshape(-1, 3)).numpy()
+    return normalization.to_world(points.reshape(-1, 3)).numpy()

@@ -21,7 +21,7 @@ from neilfpp_method.data.raw import RAW_SUFFIXES
 from neilfpp_method.data.views import (
     Camera,
     CaptureFiles,
-    Normalisation,
+    Normalization,
     SceneSource,
     View,
     check_camera,
@@ -30,7 +30,7 @@ from neilfpp_method.data.views import (
 )
 from neilfpp_method.errors import UserError
 
-__all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalisation", "Reader", "View", "load_capture"]
+__all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalization", "Reader", "View", "load_capture"]
 
 TEST_EVERY = 8
 """Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
@@ -78,7 +78,7 @@ class Capture:
         format: name of its layout in `READERS`.
         inputs: folder of masks, depth maps and other companions of the images.
         views: all views, with cameras in the world frame.
-        normalisation: the transformation from the world frame to the scene frame.
+        normalization: the transformation from the world frame to the scene frame.
         hdr: whether pixels are linear radiance; otherwise they are display values (sRGB).
         test: names of the test views.
         point_cloud: oriented point cloud; None if there is none.
@@ -89,7 +89,7 @@ class Capture:
     format: str
     inputs: Path
     views: tuple[View, ...]
-    normalisation: Normalisation
+    normalization: Normalization
     hdr: bool
     test: frozenset[str]
     point_cloud: Path | None = None
@@ -105,13 +105,17 @@ class Capture:
         """The test views, in order."""
         return tuple(view for view in self.views if view.name in self.test)
 
+    def scene_camera(self, view: View) -> Camera:
+        """The camera of a view in the scene frame."""
+        return self.normalization.camera(view.camera)
+
     @property
     def summary(self) -> str:
         """The capture in three lines for the console."""
         sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
         size = f"{sizes[0][0]}×{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
         masks = sum(view.mask is not None for view in self.views)
-        x, y, z = self.normalisation.center
+        x, y, z = self.normalization.center
         return "\n".join(
             [
                 f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
@@ -119,7 +123,7 @@ class Capture:
                 f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; "
                 f"mask files: {_of(masks, len(self.views))}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
-                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalisation.scale:.4g} "
+                f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalization.scale:.4g} "
                 "world units" + FOUND[self.scene_from],
             ]
         )
@@ -163,7 +167,7 @@ def load_capture(
         format=format,
         inputs=files.inputs,
         views=files.views,
-        normalisation=files.normalisation,
+        normalization=files.normalization,
         hdr={"auto": hdr, "linear": True, "srgb": False}[response],
         test=_test_views(root, files, test_every, test),
         point_cloud=files.point_cloud,

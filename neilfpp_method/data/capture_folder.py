@@ -13,7 +13,7 @@ import numpy as np
 
 from neilfpp_method.data.json_entry import Entry, write_json
 from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, SceneSource, View, inside
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalization, SceneSource, View, inside
 from neilfpp_method.errors import UserError
 
 __all__ = ["FILE", "LAYOUT", "Writable", "read", "read_scene", "recognize", "write_capture"]
@@ -52,7 +52,7 @@ def read(root: Path) -> CaptureFiles:
     return CaptureFiles(
         inputs=root,
         views=views,
-        normalisation=read_scene(entry["scene"]),
+        normalization=read_scene(entry["scene"]),
         point_cloud=_file(root, entry, "point_cloud"),
         test=None if test is None else frozenset(name.word() for name in test.items()),
         hdr=entry["response"].word("linear", "srgb") == "linear",
@@ -60,7 +60,7 @@ def read(root: Path) -> CaptureFiles:
     )
 
 
-def read_scene(entry: Entry) -> Normalisation:
+def read_scene(entry: Entry) -> Normalization:
     """Read the scene box from an entry with `center` and `radius`.
 
     Raises:
@@ -72,7 +72,7 @@ def read_scene(entry: Entry) -> Normalisation:
         raise UserError(
             f"{entry.name('radius')}: not positive", "give half of the longest edge of the scene box"
         )
-    return Normalisation(radius, (x, y, z))
+    return Normalization(radius, (x, y, z))
 
 
 def _source(scene: Entry) -> SceneSource:
@@ -135,7 +135,7 @@ class Writable(Protocol):
     def views(self) -> tuple[View, ...]: ...
 
     @property
-    def normalisation(self) -> Normalisation: ...
+    def normalization(self) -> Normalization: ...
 
     @property
     def point_cloud(self) -> Path | None: ...
@@ -166,8 +166,8 @@ def write_capture(
         "version": VERSION,
         "response": response,
         "scene": {
-            "centre": list(files.normalisation.center),
-            "radius": files.normalisation.scale,
+            "centre": list(files.normalization.center),
+            "radius": files.normalization.scale,
             "source": files.scene_from,
         },
         "test": [name for name in names if name in test],

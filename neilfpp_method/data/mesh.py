@@ -13,7 +13,7 @@ import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 
 __all__ = ["Mesh", "read_mesh"]
@@ -27,7 +27,7 @@ class Mesh:
     faces: Int[Tensor, "F 3"]
 
 
-def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
+def read_mesh(path: Path, normalization: Normalization) -> Mesh:
     """Read a mesh in the world frame and transform it to the scene frame. Equal vertices are not merged.
 
     Raises:
@@ -58,7 +58,7 @@ def read_mesh(path: Path, normalisation: Normalisation) -> Mesh:
         raise UserError(
             f"{path}: no triangles, or triangles with vertices that do not exist", "export it again"
         )
-    return Mesh(normalisation.to_scene(vertices).float(), faces)
+    return Mesh(normalization.to_scene(vertices).float(), faces)
 
 
 def _check_counts(path: Path) -> None:

@@ -81,7 +81,7 @@ class PixelDataset:
         self.capture = capture
         self.views = tuple(views)
         self.device = torch.device(device)
-        self._rays = CameraRays([capture.normalisation.camera(view.camera) for view in views], device)
+        self._rays = CameraRays([capture.scene_camera(view) for view in views], device)
         self.store: PixelStore = load_pixels(self.views, capture.hdr, self._has_ray, folder, on_view, exact)
         self._draws = PixelDraws(self.store.bits, len(self.store))
         if not self._draws.valid.count:
@@ -95,7 +95,7 @@ class PixelDataset:
         """Return the same pixels, with batches on another device."""
         other = copy.copy(self)
         other.device = torch.device(device)
-        cameras = [self.capture.normalisation.camera(view.camera) for view in self.views]
+        cameras = [self.capture.scene_camera(view) for view in self.views]
         other._rays = CameraRays(cameras, device)
         return other
 
@@ -291,7 +291,7 @@ class PixelDataset:
             inside = other(self.store.view_colors(i)).view(self.views[i].camera.height, -1)
             outlines.append(Outline(self.views[i], inside.numpy()))
             self.store.release()
-        return leaves_room(outlines, rays, self.capture.normalisation)
+        return leaves_room(outlines, rays, self.capture.normalization)
 
     def _linear(self, colors: Float32[np.ndarray, "*shape"]) -> Float32[Tensor, "*shape"]:
         color = torch.from_numpy(colors)

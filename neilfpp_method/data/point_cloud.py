@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64
 
 from neilfpp_method.data.ply import CODES_BY_NAME, NORMAL, POSITION, write_ply
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import OrientedPoints
 
@@ -37,14 +37,14 @@ class WorldPoints:
     normal: Float64[np.ndarray, "N 3"]
 
 
-def load_point_cloud(path: Path, normalisation: Normalisation) -> OrientedPoints:
+def load_point_cloud(path: Path, normalization: Normalization) -> OrientedPoints:
     """Read an oriented point cloud and transform it to the scene frame, with unit normals.
 
     Raises:
         UserError: as in `read_oriented_ply`.
     """
     points = read_oriented_ply(path)
-    position = normalisation.to_scene(torch.from_numpy(points.position))
+    position = normalization.to_scene(torch.from_numpy(points.position))
     normal = torch.nn.functional.normalize(torch.from_numpy(points.normal), dim=-1)
     return OrientedPoints(position.float(), normal.float())
 

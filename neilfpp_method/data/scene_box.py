@@ -18,7 +18,7 @@ from jaxtyping import Float64
 
 from neilfpp_method.data.focus import axes_of, find_focus, meeting_point
 from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement, read_outlines
-from neilfpp_method.data.views import Normalisation, SceneSource, View, check_camera
+from neilfpp_method.data.views import Normalization, SceneSource, View, check_camera
 from neilfpp_method.errors import UserError
 
 __all__ = ["SceneBox", "box_of_cameras", "box_of_focus", "box_of_points", "find_box"]
@@ -49,7 +49,7 @@ away."""
 class SceneBox:
     """The normalisation to the scene frame, and its source."""
 
-    normalisation: Normalisation
+    normalization: Normalization
     source: SceneSource
 
 
@@ -82,7 +82,7 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
     return SceneBox(box_of_cameras(views), "cameras")
 
 
-def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalisation:
+def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalization:
     """Return the box of all points but 1 % at either end of each axis, with a margin.
 
     Raises:
@@ -92,7 +92,7 @@ def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalisation:
     return _box(low, high)
 
 
-def box_of_focus(views: Sequence[View]) -> Normalisation | None:
+def box_of_focus(views: Sequence[View]) -> Normalization | None:
     """Return a ball around the point that most cameras look at, with `REACH` of their median distance as
     radius.
 
@@ -102,10 +102,10 @@ def box_of_focus(views: Sequence[View]) -> Normalisation | None:
     if focus is None:
         return None
     x, y, z = map(float, focus.center)
-    return Normalisation(REACH * focus.distance, (x, y, z))
+    return Normalization(REACH * focus.distance, (x, y, z))
 
 
-def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
+def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalization:
     """Guess the box from the cameras: `fill` times the largest circle that fits into their images.
 
     The centre is the point that most cameras look at, or else the least-squares point of all optical axes.
@@ -138,21 +138,21 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalisation:
             "take photographs from several sides of the object, or add points or a scene box",
         )
     radius = float(np.median(depth * half)) * fill
-    return Normalisation(radius, (float(center[0]), float(center[1]), float(center[2])))
+    return Normalization(radius, (float(center[0]), float(center[1]), float(center[2])))
 
 
-def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Normalisation:
+def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Normalization:
     scale = MARGIN * float((high - low).max()) / 2
     if not scale > 0:
         raise UserError("all points of the scene are equal", "add a scene box")
     x, y, z = map(float, (low + high) / 2)
-    return Normalisation(scale, (x, y, z))
+    return Normalization(scale, (x, y, z))
 
 
 # ------------------------------------------------------------------------------------------------ silhouettes
 
 
-def _carve(outlines: Sequence[Outline], start: Normalisation) -> Normalisation:
+def _carve(outlines: Sequence[Outline], start: Normalization) -> Normalization:
     """The box of the visual hull: of the points in nearly all silhouettes, on successively finer grids."""
     center, half = np.array(start.center), np.full(3, start.scale)
     low, high = center - half, center + half

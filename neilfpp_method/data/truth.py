@@ -65,7 +65,7 @@ class Truth:
         pixels = self._pixels(
             self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1, mean=False
         )
-        return None if pixels is None else pixels[:, 0] / self.capture.normalisation.scale
+        return None if pixels is None else pixels[:, 0] / self.capture.normalization.scale
 
     def mask(self, view: View) -> Bool[Tensor, " P"] | None:
         """Return which pixels show a surface, according to the depth map."""
@@ -93,7 +93,7 @@ class Truth:
     def mesh(self) -> Mesh | None:
         """Return the surface."""
         path = self._file(self.capture.inputs / "model" / "mesh.ply")
-        return None if path is None else read_mesh(path, self.capture.normalisation)
+        return None if path is None else read_mesh(path, self.capture.normalization)
 
     def light_field(self) -> LightField | None:
         """Return incident and outgoing radiance at surface points."""
@@ -121,7 +121,7 @@ class Truth:
                 f"{path}: not a light field ({error})", "remove the file, or write it again"
             ) from error
         return LightField(
-            position=self.capture.normalisation.to_scene(get["points"]),
+            position=self.capture.normalization.to_scene(get["points"]),
             normal=get["normals"],
             material=Material(get["base_color"], get["roughness"][:, None], get["metallic"][:, None]),
             wi=get["wi"],

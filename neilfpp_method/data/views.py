@@ -25,7 +25,7 @@ __all__ = [
     "Camera",
     "CameraRays",
     "CaptureFiles",
-    "Normalisation",
+    "Normalization",
     "Projection",
     "SceneSource",
     "View",
@@ -141,7 +141,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Normalisation:
+class Normalization:
     """scene = (world − centre) / scale: without rotation, directions are the same in both frames."""
 
     scale: float
@@ -174,7 +174,7 @@ class CaptureFiles:
     Attributes:
         inputs: folder to which listed paths are relative, with masks, depth maps and other files.
         views: the views, in order.
-        normalisation: the transformation from the world frame to the scene frame.
+        normalization: the transformation from the world frame to the scene frame.
         point_cloud: oriented point cloud; None if there is none.
         test: names of the test views; None if the capture states no split.
         hdr: whether pixels are linear radiance; None if the capture does not state it.
@@ -183,7 +183,7 @@ class CaptureFiles:
 
     inputs: Path
     views: tuple[View, ...]
-    normalisation: Normalisation
+    normalization: Normalization
     point_cloud: Path | None = None
     test: frozenset[str] | None = None
     hdr: bool | None = None

@@ -9,9 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.measurement import Measurement, mean_of
-from neilfpp_method.effects.place_fit import fit_places, place_errors
-from neilfpp_method.effects.places import Places
-from neilfpp_method.lighting.transport import Transport
+from neilfpp_method.effects.place_data import PlaceData
+from neilfpp_method.effects.place_fit import Permitted, fit_places, mean_errors
 
 __all__ = ["Alternative", "reduction_in_held_back_views"]
 
@@ -23,42 +22,31 @@ SCALE = 0.33
 
 @dataclass(frozen=True)
 class Alternative:
-    """A set of materials.
+    """Materials that may explain places.
 
     Attributes:
-        transport: transport to the pixels of the places, for one specular lobe.
+        data: places with their pixels, and the transport to these for one specular lobe.
         metals: whether metallic may be greater than 0.
     """
 
-    transport: Transport
+    data: PlaceData
     metals: bool
 
-    def error(self, places: Places, fitted: Tensor, held_back: Tensor, typical: float) -> Float[Tensor, " P"]:
-        """Fit to some pixels; the mean relative error of each place in the held-back ones."""
-        fit = fit_places(
-            places.where(fitted), self.transport[fitted], typical, self.metals, SCALE, rounds=ROUNDS
-        )
-        unknown = places.where(held_back)
-        return unknown.mean(place_errors(fit, unknown, self.transport[held_back], typical))
+    def error(self, turn: int, folds: int) -> Float[Tensor, " P"]:
+        """Fit with one fold held back; the mean relative error of each place in it, NaN without pixels."""
+        split = self.data.hold_back(turn, folds)
+        fit = fit_places(split.known, Permitted(self.metals, SCALE), rounds=ROUNDS)
+        return mean_errors(fit, split.held_back)
 
 
 @torch.no_grad()
 def reduction_in_held_back_views(
-    places: Places,
-    typical: float,
-    simple: Alternative,
-    rich: Alternative,
-    folds: int,
-    turns: int,
-    by: str,
-    worth: float,
+    simple: Alternative, rich: Alternative, folds: int, turns: int, by: str, worth: float
 ) -> Measurement:
     """Mean reduction of the relative error of the places by the richer alternative.
 
     Args:
-        places: places in the training views, with linear radiance.
-        typical: radiance of a typical pixel.
-        simple: the alternative whose error is the reference.
+        simple: the alternative whose error is the reference, at the same pixels as the other.
         rich: the alternative that may reduce it.
         folds: number of folds of the views; one of them is held back at a time.
         turns: number of folds that are held back in turn.
@@ -67,10 +55,7 @@ def reduction_in_held_back_views(
     """
     gains = []
     for turn in range(turns):
-        is_held_back = places.view % folds == turn
-        fitted, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
-        before, after = (one.error(places, fitted, held_back, typical) for one in (simple, rich))
-        has_views = torch.bincount(places.place[held_back], minlength=places.count) > 0
-        gains.append(torch.where(has_views, before - after, torch.nan))
+        before, after = (one.error(turn, folds) for one in (simple, rich))
+        gains.append(before - after)
     gain = torch.stack(gains).nanmean(0)
     return mean_of(gain[gain.isfinite()], f"reduction of the error in held-back views by {by}", worth)

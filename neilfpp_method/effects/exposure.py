@@ -117,7 +117,7 @@ def _log_values(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "
     """Logarithm of the linear value of each point in each view; NaN where the view is not usable."""
     log_values = torch.full((len(points), len(pixels.views), 3), torch.nan)
     for number, view in enumerate(pixels.views):
-        camera = pixels.capture.normalisation.camera(view.camera)
+        camera = pixels.capture.scene_camera(view)
         projected = project(camera, points.position)
         column, row = projected.pixel.floor().long().unbind(-1)
         # The eight neighbouring pixels must lie in the image as well.

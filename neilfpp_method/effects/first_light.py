@@ -19,17 +19,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.lamps import LampTrial
+from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
     ROUNDS,
     STEPS,
+    Permitted,
     PlaceFit,
     fit_places,
     place_errors,
     seconds_of_step,
 )
-from neilfpp_method.effects.places import Places
-from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material, Observed
 
@@ -100,33 +100,33 @@ class FirstLight:
 
 
 @torch.no_grad()
-def find_first_light(places: Places, transport: Transport, typical: float, metals: bool) -> FirstLight | None:
+def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
     """Fit a map together with the materials of places.
 
     Args:
-        places: places with their pixels in the training views, in linear radiance.
-        transport: transport to the same pixels (`place_fit.place_transport`).
-        typical: radiance of a typical pixel.
+        data: places with their pixels in the training views.
         metals: whether metallic may be greater than 0.
 
     Returns:
         The initial light; None if there are fewer than `MIN_PLACES` places.
     """
+    places = data.places
     numbers = places.place.unique()
     if len(numbers) < MIN_PLACES:
         return None
-    is_held_back = places.view % FOLDS == 0
-    fitted, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
-    known = places.where(fitted), transport[fitted]
-    unknown = places.where(held_back), transport[held_back]
-
-    fits = {FIRST_SCALE: fit_places(*known, typical, metals, FIRST_SCALE)}
+    split = data.hold_back(0, FOLDS)
+    fits = {FIRST_SCALE: fit_places(split.known, Permitted(metals, FIRST_SCALE))}
     for scale in (*(s for s in SCALES if s > FIRST_SCALE), *(s for s in reversed(SCALES) if s < FIRST_SCALE)):
         start = _rescaled(fits, scale)
-        fits[scale] = fit_places(*known, typical, metals, scale, start, CARRIED_ROUNDS)
-    errors = {scale: place_errors(fit, *unknown, typical).mean().item() for scale, fit in fits.items()}
+        fits[scale] = fit_places(split.known, Permitted(metals, scale), start, CARRIED_ROUNDS)
+    errors = {scale: place_errors(fit, split.held_back).mean().item() for scale, fit in fits.items()}
     scale = _lowest(errors)
-    best = fit_places(places, transport, typical, metals, scale, _rescaled(fits, scale), CARRIED_ROUNDS)
+    start = _rescaled(fits, scale)
+
+    def fit_on(changed: PlaceData) -> PlaceFit:
+        return fit_places(changed, Permitted(metals, scale), start, CARRIED_ROUNDS)
+
+    best = fit_on(data)
     materials = best.material(numbers)
     mean = Material(
         materials.base_color.log().mean(0, keepdim=True).exp(),
@@ -135,15 +135,15 @@ def find_first_light(places: Places, transport: Transport, typical: float, metal
     )
     drawn = torch.randperm(len(places.place), device=places.place.device)[:LAMP_PIXELS]
     material = best.material(places.place[drawn])
-    even = Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic)
-    start = _rescaled(fits, scale)
-
-    def refit(changed: Transport) -> PlaceFit:
-        return fit_places(known[0], changed, typical, metals, scale, start, CARRIED_ROUNDS)
-
-    trial = LampTrial(*known, *unknown, typical, refit)
     return FirstLight(
-        best.log_radiance, mean, errors, scale, len(numbers), places.observed[drawn], even, trial
+        log_radiance=best.log_radiance,
+        mean=mean,
+        errors=errors,
+        scale=scale,
+        places=len(numbers),
+        observed=places.observed[drawn],
+        material=Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic),
+        lamp_trial=LampTrial(split, fit_on),
     )
 
 

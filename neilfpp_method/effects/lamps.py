@@ -12,17 +12,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from neilfpp_method.effects.material_grid import ROUGHNESSES
-from neilfpp_method.effects.place_fit import PlaceFit, place_errors
-from neilfpp_method.effects.places import Places
-from neilfpp_method.fields.lamps import LampPlaces, Lamps
+from neilfpp_method.effects.place_data import PlaceData, Split
+from neilfpp_method.effects.place_fit import PlaceFit, mean_errors
+from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.fit import Evidence, evidence
-from neilfpp_method.lighting.transport import Transport, in_sight, lamp_kernel
+from neilfpp_method.lighting.lamp_transport import in_sight
+from neilfpp_method.lighting.layered_transport import lamp_layers
 from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import Observed, SceneTracer
+from neilfpp_method.structures import SceneTracer
 
 __all__ = ["LampTrial"]
 
@@ -32,20 +31,12 @@ class LampTrial:
     """A fit without lamps, and what is needed to repeat it with lamps.
 
     Attributes:
-        known: the pixels of the fitted views.
-        transport: the transport to these pixels, without lamps.
-        held_back: the pixels of the held-back views.
-        held_back_transport: the transport to the held-back pixels.
-        typical: radiance of a typical pixel.
-        refit: fits light and materials to the known pixels, given their transport.
+        split: the pixels of the fitted and of the held-back views, with the transport without lamps.
+        refit: fits light and materials.
     """
 
-    known: Places
-    transport: Transport
-    held_back: Places
-    held_back_transport: Transport
-    typical: float
-    refit: Callable[[Transport], PlaceFit]
+    split: Split
+    refit: Callable[[PlaceData], PlaceFit]
 
     @torch.no_grad()
     def __call__(self, lamps: Lamps, lobe: Lobe, scene: SceneTracer | None) -> Evidence:
@@ -56,30 +47,17 @@ class LampTrial:
             lobe: the specular lobe.
             scene: traces shadow rays; None if inter-reflection is off.
         """
-        fitted, held_back = (
-            replace(transport, scene=transport.scene + _lamp_light(lamps, places.observed, lobe, scene))
-            for transport, places in (
-                (self.transport, self.known),
-                (self.held_back_transport, self.held_back),
-            )
+        known, held_back = (
+            _lit(data, lamps, lobe, scene) for data in (self.split.known, self.split.held_back)
         )
-        without = self._errors(self.refit(self.transport), self.held_back_transport)
-        gain = without - self._errors(self.refit(fitted), held_back)
-        return replace(evidence(gain[self.held_back.place.unique()]), in_views=True)
-
-    def _errors(self, fit: PlaceFit, transport: Transport) -> Float[Tensor, " P"]:
-        return self.held_back.mean(place_errors(fit, self.held_back, transport, self.typical))
+        without = mean_errors(self.refit(self.split.known), self.split.held_back)
+        gain = without - mean_errors(self.refit(known), held_back)
+        return replace(evidence(gain[gain.isfinite()]), in_views=True)
 
 
-def _lamp_light(
-    lamps: Lamps, observed: Observed, lobe: Lobe, scene: SceneTracer | None
-) -> Float[Tensor, "K N 3"]:
-    """Light of the lamps via points, with the layers of `from_texels_at`."""
-    places = LampPlaces(lamps.position[: lamps.count], lamps.axis[: lamps.count])
-    sight = in_sight(places, lamps.radius, observed.position, scene)
-    layers = []
-    for number, value in enumerate(ROUGHNESSES):
-        roughness = torch.full_like(observed.position[:, :1], value)
-        kernel = lamp_kernel(places, lamps.radius, sight, observed, roughness, lobe)
-        layers.append((kernel if number == 0 else kernel[1:]) @ lamps.intensity[: lamps.count])
-    return torch.cat(layers)
+def _lit(data: PlaceData, lamps: Lamps, lobe: Lobe, scene: SceneTracer | None) -> PlaceData:
+    """The same data with the light of lamps, as light that the scene sends."""
+    observed = data.places.observed
+    sight = in_sight(lamps.lit_places, lamps.radius, observed.position, scene)
+    added = lamp_layers(lamps, sight, observed, ROUGHNESSES, lobe)
+    return replace(data, transport=replace(data.transport, scene=data.transport.scene + added))

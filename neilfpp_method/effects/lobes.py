@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from neilfpp_method.effects.alternatives import Alternative, reduction_in_held_back_views
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.place_fit import place_transport
+from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import Places
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import SceneTracer
@@ -36,7 +36,7 @@ def lobe_evidence(places: Places, scene: SceneTracer | None, typical: float, met
         metals: whether metallic may be greater than 0.
     """
     gaussian, ggx = (
-        Alternative(place_transport(places, LOBES[name], scene), metals)
+        Alternative(PlaceData(places, place_transport(places, LOBES[name], scene), typical), metals)
         for name in ("spherical_gaussian", "ggx")
     )
-    return reduction_in_held_back_views(places, typical, gaussian, ggx, FOLDS, FOLDS, "GGX", WORTH)
+    return reduction_in_held_back_views(gaussian, ggx, FOLDS, FOLDS, "GGX", WORTH)

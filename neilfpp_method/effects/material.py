@@ -21,18 +21,19 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.noise import lobe_noise
+from neilfpp_method.effects.place_data import PlaceData, Split, place_transport
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
     ROUNDS,
     STEPS,
+    Permitted,
     PlaceFit,
-    any_map,
     fit_places,
+    mean_errors,
     place_errors,
-    place_transport,
     seconds_of_step,
 )
-from neilfpp_method.effects.places import Places, gather_places
+from neilfpp_method.effects.places import gather_places
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES
@@ -107,10 +108,11 @@ def material_evidence(
     if not len(places.place):
         return {name: Measurement("views of the same place", 0.0, 0.0, WORTH, 0) for name in names}
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)
-    judged = judge_material(places, transport, model.facts.median_radiance, names, model.brdf.metals)
-    if "lobe-sampling" in names:
-        judged.measured["lobe-sampling"] = lobe_noise(model, places, judged.glossy)
-    return judged.measured
+    data = PlaceData(places, transport, model.facts.median_radiance)
+    judged = judge_material(data, names, model.brdf.metals)
+    if "lobe-sampling" not in names:
+        return judged.measured
+    return {**judged.measured, "lobe-sampling": lobe_noise(model, places, judged.glossy)}
 
 
 def seconds_of_evidence(device: torch.device) -> float:
@@ -137,23 +139,24 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Model:
-    """The set of materials and lights that a fit may choose from.
+class Variant:
+    """A fit with all effects, or without one of them.
 
     Attributes:
+        permitted: metals and maps.
         reflects: whether surfaces have a specular lobe.
-        metals: whether metallic may be greater than 0.
         roughness: index of the common roughness of all places; None if each place has its own.
-        form: projection of the map (see `fit_places`).
     """
 
+    permitted: Permitted
     reflects: bool = True
-    metals: bool = False
     roughness: int | None = None
-    form: Callable[[Tensor], Tensor] = any_map
 
-    def restrict(self, transport: Transport) -> Transport:
-        """The transport with the specular layers that this model permits."""
+    def restrict(self, data: PlaceData) -> PlaceData:
+        """The data with only the specular layers that this variant permits."""
+        return replace(data, transport=self._restrict(data.transport))
+
+    def _restrict(self, transport: Transport) -> Transport:
         if not self.reflects:
             keep = torch.zeros(len(transport.sources), 1, 1, device=transport.scene.device)
             keep[0] = 1
@@ -166,7 +169,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Explained:
-    """A fit of a model and its errors.
+    """A fit of a variant and its errors.
 
     Attributes:
         fit: the fitted light and materials.
@@ -179,78 +182,48 @@ class Explained:
     error: Float[Tensor, " P"]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """The pixels of one split of the views.
-
-    Attributes:
-        known: the pixels to which models are fitted.
-        transport: the transport to these pixels.
-        held_back: the pixels of the held-back views.
-        held_back_transport: the transport to the held-back pixels.
-        typical: radiance of a typical pixel.
-    """
-
-    known: Places
-    transport: Transport
-    held_back: Places
-    held_back_transport: Transport
-    typical: float
-
-    def fit(self, model: Model, start: PlaceFit | None = None) -> Explained:
-        """Fit a model, from a given fit on if there is one, and evaluate it in the held-back views."""
-        transport, typical = model.restrict(self.transport), self.typical
-        rounds = ROUNDS if start is None else CARRIED_ROUNDS
-        fit = fit_places(self.known, transport, typical, model.metals, None, start, rounds, model.form)
-        if model.roughness is not None:
-            fit = replace(fit, roughness=torch.full_like(fit.roughness, model.roughness))
-        fitted = place_errors(fit, self.known, transport, typical).mean().item()
-        held_back, held_back_transport = self.held_back, model.restrict(self.held_back_transport)
-        error = held_back.mean(place_errors(fit, held_back, held_back_transport, typical))
-        has_pixels = torch.bincount(held_back.place, minlength=held_back.count) > 0
-        return Explained(fit, fitted, torch.where(has_pixels, error, torch.nan))
+def explain(split: Split, variant: Variant, start: PlaceFit | None = None) -> Explained:
+    """Fit a variant, from a given fit on if there is one, and evaluate it in the held-back views."""
+    known, held_back = variant.restrict(split.known), variant.restrict(split.held_back)
+    fit = fit_places(known, variant.permitted, start, ROUNDS if start is None else CARRIED_ROUNDS)
+    if variant.roughness is not None:
+        fit = replace(fit, roughness=torch.full_like(fit.roughness, variant.roughness))
+    return Explained(fit, place_errors(fit, known).mean().item(), mean_errors(fit, held_back))
 
 
 @torch.no_grad()
-def judge_material(
-    places: Places, transport: Transport, typical: float, names: frozenset[str], metals: bool
-) -> Judged:
+def judge_material(data: PlaceData, names: frozenset[str], metals: bool) -> Judged:
     """Measure the reduction of the error in held-back views by each of `names`.
 
     Args:
-        places: places with their pixels, in linear radiance.
-        transport: the transport to these pixels (`place_transport`).
-        typical: radiance of a typical pixel.
+        data: places with their pixels.
         names: the effects to measure.
         metals: whether metallic may be greater than 0 in the fits with specular reflection.
     """
-    trials = []
-    for turn in range(TURNS):
-        is_held_back = places.view % FOLDS == turn
-        known, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
-        parts = (places.where(known), transport[known], places.where(held_back), transport[held_back])
-        trials.append(Trial(*parts, typical))
+    splits = [data.hold_back(turn, FOLDS) for turn in range(TURNS)]
 
-    def fit_all(model: Model) -> list[Explained]:
-        return [trial.fit(model) for trial in trials]
+    def explain_all(variant: Variant) -> list[Explained]:
+        return [explain(split, variant) for split in splits]
 
-    glossy = Model(metals=metals)
-    glossy_fits = fit_all(glossy)
+    glossy = Variant(Permitted(metals))
+    glossy_fits = explain_all(glossy)
     measured: dict[str, Measurement] = {}
     if "varying-roughness" in names:
 
         def with_roughness(number: int, turn: int) -> Explained:
-            return trials[turn].fit(replace(glossy, roughness=number), glossy_fits[turn].fit)
+            return explain(splits[turn], replace(glossy, roughness=number), glossy_fits[turn].fit)
 
         shared = min(SHARED, key=lambda number: with_roughness(number, 0).fitted_error)
         shared_fits = [with_roughness(shared, turn) for turn in range(TURNS)]
         counted = [(one.fit.roughness - shared).abs() >= MIN_INDEX_DIFFERENCE for one in glossy_fits]
         measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
     if "reflection" in names:
-        measured["reflection"] = _saved("reflection", fit_all(Model(reflects=False)), glossy_fits)
+        matte = Variant(Permitted(metals=False), reflects=False)
+        measured["reflection"] = _saved("reflection", explain_all(matte), glossy_fits)
     for name, form in LIGHT_FORMS.items():
         if name in names:
-            measured[name] = _saved(name, fit_all(replace(glossy, form=form)), glossy_fits)
+            limited = Variant(Permitted(metals, form=form))
+            measured[name] = _saved(name, explain_all(limited), glossy_fits)
     return Judged({name: measured[name] for name in SAVED if name in names}, glossy_fits[0].fit)
 
 

@@ -100,7 +100,7 @@ def best_materials(
     and its neighbours is chosen.
 
     Args:
-        arriving: the parts of outgoing radiance under the light (`lighting.transport.from_texels_at`).
+        arriving: the parts of outgoing radiance under the light (`lighting.layered_transport`).
         places: the places with their pixels, in linear radiance.
         typical: radiance of a typical pixel.
         metallics: values of metallic that are tried, the first ones of `METALLICS`.

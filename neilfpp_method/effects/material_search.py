@@ -32,11 +32,10 @@ from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.transport import arriving_at
+from neilfpp_method.lighting.layered_transport import layers_at, light_layers
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
-from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import Material, Observed
+from neilfpp_method.structures import Material
 
 __all__ = [
     "SEARCH_AT",
@@ -131,11 +130,13 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     """
     numbers, place = places.place.unique(return_inverse=True)
     places = Places(len(numbers), place, places.view, places.observed)
-    position = places.mean(places.observed.position)
-    current, typical = model.brdf(position), model.facts.median_radiance
-    arriving = _arriving(model, places, position)
+    shared = places.shared_points()
+    current, typical = model.brdf(shared.position), model.facts.median_radiance
+    light = LightModel(model.light, model.lamps)
+    draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]
+    arriving = torch.stack(draws).mean(0)
     look = COLOR_SCALE * current.base_color.clamp_min(MIN_BASE_COLOR).log()
-    near = neighbors(torch.cat((position, look), -1), NEIGHBORS_SHARE)
+    near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
     loss = _loss_of(current, arriving, places, typical, near)
     best = best_materials(arriving, places, typical, METALLICS, near)
     found = on_grid(best.base_color, best.roughness, best.metallic)
@@ -146,23 +147,13 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
 
 
-def _arriving(model: NeilfModel, places: Places, position: Float[Tensor, "P 3"]) -> Float[Tensor, "K N 3"]:
-    """The parts of outgoing radiance at the roughnesses of the grid, averaged over random directions."""
-    normal = safe_normalize(places.mean(places.observed.normal))
-    points = Observed(position, normal, normal, torch.zeros_like(normal))
-    arguments = (points, places.observed, places.place, ROUGHNESSES, model.lobe, model.scene)
-    draws = [arriving_at(LightModel(model.light, model.lamps), *arguments) for _ in range(DRAWS)]
-    return torch.stack(draws).mean(0)
-
-
 def _loss_of(
     material: Material, arriving: Float[Tensor, "K N 3"], places: Places, typical: float, near: Tensor
 ) -> Float[Tensor, " P"]:
     """The loss of `best_materials` for given materials, with roughness rounded to the grid."""
     grid = torch.tensor(ROUGHNESSES, device=near.device).log()
-    k = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)[places.place]
-    rows = torch.arange(len(k), device=k.device)
-    sent = torch.stack((arriving[0], arriving[1 + 2 * k, rows], arriving[2 + 2 * k, rows]))
+    number = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)
+    sent = layers_at(arriving, number[places.place])
     pixel = material[places.place]
     error = relative_error(outgoing_radiance(sent, pixel.base_color, pixel.metallic), places, typical)
     return mean_loss(error, places, near)

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from neilfpp_method.effects.alternatives import Alternative, reduction_in_held_back_views
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.places import Places
-from neilfpp_method.lighting.transport import Transport
+from neilfpp_method.effects.place_data import PlaceData
 
 __all__ = ["metals_evidence"]
 
@@ -31,13 +30,7 @@ only if they increase the error.
 """
 
 
-def metals_evidence(places: Places, transport: Transport, typical: float) -> Measurement:
-    """Mean reduction of the relative error of the places by metals, in held-back views.
-
-    Args:
-        places: places in the training views, with linear radiance.
-        transport: transport to the same pixels (`place_fit.place_transport`).
-        typical: radiance of a typical pixel.
-    """
-    paint, metal = (Alternative(transport, metals) for metals in (False, True))
-    return reduction_in_held_back_views(places, typical, paint, metal, FOLDS, TURNS, "metals", WORTH)
+def metals_evidence(data: PlaceData) -> Measurement:
+    """Mean reduction of the relative error of the places by metals, in held-back views."""
+    paint, metal = Alternative(data, metals=False), Alternative(data, metals=True)
+    return reduction_in_held_back_views(paint, metal, FOLDS, TURNS, "metals", WORTH)

@@ -16,10 +16,10 @@ from neilfpp_method.effects.place_fit import PlaceFit
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
-from neilfpp_method.incident import Sources, arriving, draw_directions
+from neilfpp_method.incident import Sources, arriving
 from neilfpp_method.lighting.objective import FLOOR
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.shading import LOBES, shade
+from neilfpp_method.shading import LOBES, Sampling, sample_directions, shade
 
 __all__ = ["WORTH", "lobe_noise"]
 
@@ -47,21 +47,14 @@ def lobe_noise(model: NeilfModel, places: Places, fit: PlaceFit) -> Measurement:
     light = EnvironmentLight(fit.log_radiance.shape[1], 1.0).to(device)
     light.show(fit.log_radiance.exp())
     sources = Sources(light, Lamps(0, model.lamps.radius).to(device), model.scene)
-
-    lobe = LOBES[model.config.shading.lobe]
+    count, lobe = model.config.shading.train_samples, LOBES[model.config.shading.lobe]
 
     def noise(sampler: str) -> Float[Tensor, " P"]:
+        sampling = Sampling(sampler, count, lobe, stochastic=True)
         colors = []
         for _ in range(TIMES):
-            drawn = draw_directions(
-                sampler,
-                light,
-                observed.normal,
-                observed.wo,
-                material.roughness,
-                model.config.shading.train_samples,
-                lobe,
-                stochastic=True,
+            drawn = sample_directions(
+                sampling, observed.normal, observed.wo, material.roughness, light.technique(observed.normal)
             )
             arrived = arriving(sources, observed.position, drawn)
             colors.append(shade(material, observed.normal, observed.wo, arrived, lobe).color)

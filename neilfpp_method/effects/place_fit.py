@@ -1,14 +1,12 @@
 """Jointly fit an environment map and the materials of surface places.
 
-Each place has a base colour, a roughness from a grid, and a metallic from a grid. Because there are few
-places, the transport is stored as a matrix for each roughness. Two steps alternate: the best material under
-the current light is found by trying all pairs of roughness and metallic, and the best light under the current
-materials is found by gradient descent.
+Each place has a base colour, a roughness from a grid, and a metallic from a grid. Two steps alternate: the
+best material under the current light is found by trying all pairs of roughness and metallic, and the best
+light under the current materials is found by gradient descent.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable
@@ -22,34 +20,20 @@ from torch.nn import functional
 from neilfpp_method.effects.material_grid import (
     METALLICS,
     MIN_BASE_COLOR,
-    ROUGHNESSES,
     best_materials,
     neighbors,
     on_grid,
     outgoing_radiance,
     relative_error,
 )
-from neilfpp_method.effects.places import Places
-from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.effects.place_data import ROWS, PlaceData
+from neilfpp_method.lighting.layered_transport import layers_at
 from neilfpp_method.lighting.objective import OUTLIER, total_variation
-from neilfpp_method.lighting.transport import Transport, from_texels_at
-from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import Material, Observed, SceneTracer
+from neilfpp_method.lighting.transport import Transport
+from neilfpp_method.structures import Material
 
-__all__ = [
-    "PlaceFit",
-    "any_map",
-    "fit_places",
-    "place_errors",
-    "place_transport",
-    "seconds_of_step",
-]
+__all__ = ["Permitted", "PlaceFit", "fit_places", "mean_errors", "place_errors", "seconds_of_step"]
 
-ROWS = 16
-"""Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
-DIRECTIONS = 4
-"""Random directions per texel and pixel: a lobe of roughness 0.2 is narrower than a texel."""
 ROUNDS = 6
 """Number of alternations between light and material."""
 FIRST_STEPS = 100
@@ -108,24 +92,116 @@ class PlaceFit:
         return on_grid(self.base_color[place], self.roughness[place], self.metallic[place])
 
 
-@torch.no_grad()
-def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Transport:
-    """The transport from the texels of a map to N pixels, with the layers of `from_texels_at`.
+def _any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
+    """The identity: every texel and channel of the map is a free unknown."""
+    return log_radiance
 
-    It takes 21 kB per pixel. Rays are traced once per place, from the mean of the points that its views hit.
+
+@dataclass(frozen=True)
+class Permitted:
+    """The lights and materials that a fit may choose from.
+
+    Attributes:
+        metals: whether metallic may be greater than 0.
+        mean_base_color: value of the geometric mean of base colour over places and channels; None if it is
+            free.
+        form: projection of log radiance onto the permitted maps.
     """
-    environment = EnvironmentLight(ROWS, 1.0).to(places.place.device)
-    position, normal = places.mean(places.observed.position), places.mean(places.observed.normal)
-    points = Observed(position, safe_normalize(normal), normal, torch.zeros_like(normal))
-    drawn = [
-        from_texels_at(environment, points, places.observed, places.place, ROUGHNESSES, lobe, scene)
-        for _ in range(DIRECTIONS)
-    ]
-    sources, scene_light = (
-        functools.reduce(torch.add, (getattr(part, name) / DIRECTIONS for part in drawn))
-        for name in ("sources", "scene")
+
+    metals: bool
+    mean_base_color: float | None = None
+    form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = _any_map
+
+
+def fit_places(
+    data: PlaceData, permitted: Permitted, start: PlaceFit | None = None, rounds: int = ROUNDS
+) -> PlaceFit:
+    """Fit light and materials of places.
+
+    Args:
+        data: places with their pixels.
+        permitted: the lights and materials to choose from.
+        start: initial values; None for a grey dielectric under an even light.
+        rounds: number of alternations between light and material.
+    """
+    places = data.places
+    base_color = permitted.mean_base_color or START_BASE_COLOR
+    fit = _even_start(data, base_color) if start is None else start
+    near = neighbors(places.mean(places.observed.position), NEIGHBORS_SHARE)
+    metallics = METALLICS if permitted.metals else METALLICS[:1]
+    for turn in range(rounds):
+        steps = FIRST_STEPS if start is None and turn == 0 else STEPS
+        fit = _better_light(fit, data, permitted, steps)
+        sent = [part.float() @ fit.radiance for part in data.transport.sources]
+        arriving = torch.stack(sent) + data.transport.scene
+        best = best_materials(arriving, places, data.typical, metallics, near)
+        fit = PlaceFit(fit.log_radiance, best.base_color, best.roughness, best.metallic)
+    return fit
+
+
+def _even_start(data: PlaceData, base_color: float) -> PlaceFit:
+    """A grey dielectric under an even light."""
+    device, count = data.places.place.device, data.places.count
+    return PlaceFit(
+        log_radiance=torch.full((3, ROWS, 2 * ROWS), math.log(data.typical / base_color), device=device),
+        base_color=torch.full((count, 3), base_color, device=device),
+        roughness=torch.full((count,), START_ROUGHNESS, device=device),
+        metallic=torch.zeros(count, dtype=torch.long, device=device),
     )
-    return Transport(sources, scene_light)
+
+
+@torch.no_grad()
+def place_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " N"]:
+    """Relative error of each pixel, clipped at 1 and averaged over the channels."""
+    place = data.places.place
+    sent = _at_roughness(data.transport, fit.roughness[place]).arriving(fit.radiance)
+    material = fit.material(place)
+    outgoing = outgoing_radiance(sent, material.base_color, material.metallic)
+    return relative_error(outgoing, data.places, data.typical).abs().clamp_max(1).mean(-1)
+
+
+def mean_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " P"]:
+    """Mean of `place_errors` for each place; NaN for a place without pixels."""
+    places = data.places
+    has_pixels = torch.bincount(places.place, minlength=places.count) > 0
+    return torch.where(has_pixels, places.mean(place_errors(fit, data)), torch.nan)
+
+
+def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
+    """The diffuse, facing and grazing parts of each pixel at the roughness of its place."""
+    return Transport(layers_at(transport.sources, number).float(), layers_at(transport.scene, number))
+
+
+def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: int) -> PlaceFit:
+    """Improve the light and the base colours by descent, with fixed roughness and metallic."""
+    place = data.places.place
+    selected = _at_roughness(data.transport, fit.roughness[place])
+    metallic = fit.material(place).metallic
+    log_radiance = fit.log_radiance.clone().requires_grad_()
+    gain = torch.zeros_like(fit.base_color, requires_grad=True)
+    groups = [{"params": [log_radiance], "lr": RATE}, {"params": [gain], "lr": GAIN_RATE}]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+    with torch.enable_grad():
+        for _ in range(steps):
+            base_color = fit.base_color * gain.exp()
+            sent = selected.arriving(permitted.form(log_radiance).exp().flatten(1).t())
+            outgoing = outgoing_radiance(sent, base_color.clamp(0, 1)[place], metallic)
+            error = relative_error(outgoing, data.places, data.typical)
+            loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
+            loss = loss + SMOOTHNESS * total_variation(log_radiance)
+            loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
+            if permitted.mean_base_color is not None:
+                off = _log_mean(base_color) - math.log(permitted.mean_base_color)
+                loss = loss + SCALE_WEIGHT * off.square()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+    base_color = (fit.base_color * gain.detach().exp()).clamp(MIN_BASE_COLOR, 1)
+    return PlaceFit(permitted.form(log_radiance).detach(), base_color, fit.roughness, fit.metallic)
+
+
+def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
+    return base_color.clamp_min(MIN_BASE_COLOR).log().mean()
 
 
 def seconds_of_step(pixels: int, device: torch.device) -> float:
@@ -141,110 +217,3 @@ def seconds_of_step(pixels: int, device: torch.device) -> float:
     # `item` waits for the device.
     back.sum().item()
     return (time.perf_counter() - began) / TRIED
-
-
-def any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
-    """The identity: every texel and channel of the map is a free unknown."""
-    return log_radiance
-
-
-def fit_places(
-    places: Places,
-    transport: Transport,
-    typical: float,
-    metals: bool,
-    mean_base_color: float | None = None,
-    start: PlaceFit | None = None,
-    rounds: int = ROUNDS,
-    form: Callable[[Float[Tensor, "3 H W"]], Float[Tensor, "3 H W"]] = any_map,
-) -> PlaceFit:
-    """Fit light and materials of places.
-
-    Args:
-        places: places with their pixels, in linear radiance.
-        transport: the transport to these pixels.
-        typical: radiance of a typical pixel.
-        metals: whether metallic may be greater than 0.
-        mean_base_color: value of the geometric mean of base colour over places and channels; None if it is
-            free.
-        start: initial values; None for a grey dielectric under an even light.
-        rounds: number of alternations between light and material.
-        form: projection of log radiance onto the permitted maps.
-    """
-    base_color = START_BASE_COLOR if mean_base_color is None else mean_base_color
-    fit = _even_start(places, typical, base_color) if start is None else start
-    near = neighbors(places.mean(places.observed.position), NEIGHBORS_SHARE)
-    for turn in range(rounds):
-        steps = FIRST_STEPS if start is None and turn == 0 else STEPS
-        fit = _better_light(fit, places, transport, typical, steps, mean_base_color, form)
-        arriving = torch.stack([part.float() @ fit.radiance for part in transport.sources]) + transport.scene
-        best = best_materials(arriving, places, typical, METALLICS if metals else METALLICS[:1], near)
-        fit = PlaceFit(fit.log_radiance, best.base_color, best.roughness, best.metallic)
-    return fit
-
-
-def _even_start(places: Places, typical: float, base_color: float) -> PlaceFit:
-    """A grey dielectric under an even light."""
-    device, count = places.place.device, places.count
-    return PlaceFit(
-        log_radiance=torch.full((3, ROWS, 2 * ROWS), math.log(typical / base_color), device=device),
-        base_color=torch.full((count, 3), base_color, device=device),
-        roughness=torch.full((count,), START_ROUGHNESS, device=device),
-        metallic=torch.zeros(count, dtype=torch.long, device=device),
-    )
-
-
-@torch.no_grad()
-def place_errors(fit: PlaceFit, places: Places, transport: Transport, typical: float) -> Float[Tensor, " N"]:
-    """Relative error of each pixel, clipped at 1 and averaged over the channels."""
-    selected = _at_roughness(transport, fit.roughness[places.place])
-    sent = selected.arriving(fit.radiance)
-    material = fit.material(places.place)
-    outgoing = outgoing_radiance(sent, material.base_color, material.metallic)
-    return relative_error(outgoing, places, typical).abs().clamp_max(1).mean(-1)
-
-
-def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
-    """The diffuse, facing and grazing parts of each pixel at the roughness of its place."""
-    rows = torch.arange(len(number), device=number.device)
-    layers = torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number))
-    return Transport(transport.sources[layers, rows].float(), transport.scene[layers, rows])
-
-
-def _better_light(
-    fit: PlaceFit,
-    places: Places,
-    transport: Transport,
-    typical: float,
-    steps: int,
-    mean_base_color: float | None,
-    form: Callable[[Tensor], Tensor],
-) -> PlaceFit:
-    """Improve the light and the base colours by descent, with fixed roughness and metallic."""
-    selected = _at_roughness(transport, fit.roughness[places.place])
-    metallic = fit.material(places.place).metallic
-    log_radiance = fit.log_radiance.clone().requires_grad_()
-    gain = torch.zeros_like(fit.base_color, requires_grad=True)
-    groups = [{"params": [log_radiance], "lr": RATE}, {"params": [gain], "lr": GAIN_RATE}]
-    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
-    with torch.enable_grad():
-        for _ in range(steps):
-            base_color = fit.base_color * gain.exp()
-            sent = selected.arriving(form(log_radiance).exp().flatten(1).t())
-            outgoing = outgoing_radiance(sent, base_color.clamp(0, 1)[places.place], metallic)
-            error = relative_error(outgoing, places, typical)
-            loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
-            loss = loss + SMOOTHNESS * total_variation(log_radiance)
-            loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
-            if mean_base_color is not None:
-                off = _log_mean(base_color) - math.log(mean_base_color)
-                loss = loss + SCALE_WEIGHT * off.square()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-    base_color = (fit.base_color * gain.detach().exp()).clamp(MIN_BASE_COLOR, 1)
-    return PlaceFit(form(log_radiance).detach(), base_color, fit.roughness, fit.metallic)
-
-
-def _log_mean(base_color: Float[Tensor, "P 3"]) -> Float[Tensor, ""]:
-    return base_color.clamp_min(MIN_BASE_COLOR).log().mean()

@@ -8,13 +8,14 @@ neighbours that other views showed, and neighbours together are a place.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import nn
 
 from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
 from neilfpp_method.effects.material_search import is_search_due
-from neilfpp_method.effects.place_fit import place_transport
+from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import MIN_COSINE, SAME_NORMAL, Places
 from neilfpp_method.effects.review import improve_material
 from neilfpp_method.lighting.ring import Ring
@@ -49,7 +50,7 @@ class PlaceSolver(nn.Module):
     def __init__(self, response: str, say: Callable[[str], object]) -> None:
         super().__init__()
         self.response, self.say = response, say
-        self.points = Ring(PIXELS, 12)
+        self.points = Ring(PIXELS, Observed.WIDTH)
         self._steps, self._tried, self._searched = 0, False, -1
 
     def is_waiting(self, light_solver: LightSolver) -> bool:
@@ -60,11 +61,10 @@ class PlaceSolver(nn.Module):
     def observe(self, surface: Observed) -> None:
         """Remember the surface points of a step that trains material, in place of the oldest."""
         usable = (surface.normal * surface.wo).sum(-1) > MIN_COSINE
-        pixel = surface.pixel
         if self.response == "srgb":
-            usable = usable & (pixel.amax(-1) < CLIPPED)
-            pixel = srgb_to_linear(pixel)
-        self.points.keep(torch.cat((surface.position, surface.normal, surface.wo, pixel), -1)[usable])
+            usable = usable & (surface.pixel.amax(-1) < CLIPPED)
+            surface = replace(surface, pixel=srgb_to_linear(surface.pixel))
+        self.points.keep(surface.rows()[usable])
         self._steps += 1
 
     def before_step(self, model: NeilfModel, light_solver: LightSolver, position: StagePosition) -> None:
@@ -89,7 +89,7 @@ class PlaceSolver(nn.Module):
 
         There are no places before the first point.
         """
-        observed = Observed(*self.points.kept().split(3, -1))
+        observed = Observed.of_rows(self.points.kept())
         count = len(observed)
         center = observed[torch.randperm(count, device=observed.position.device)[:PLACES]]
         distance = torch.cdist(observed.position, center.position)
@@ -110,7 +110,8 @@ class PlaceSolver(nn.Module):
         rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
         self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")
         transport = place_transport(places, model.lobe, model.scene)
-        first = find_first_light(places, transport, model.facts.median_radiance, model.brdf.metals)
+        data = PlaceData(places, transport, model.facts.median_radiance)
+        first = find_first_light(data, model.brdf.metals)
         if first is not None:
             self.say(first.summary())
             start_with(model, first)

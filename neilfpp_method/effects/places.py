@@ -8,15 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import project
 from neilfpp_method.fields.exposure import at_mean_exposure
+from neilfpp_method.lighting.layered_transport import SharedPoints
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
-from neilfpp_method.structures import Observed
+from neilfpp_method.shading.frame import safe_normalize
+from neilfpp_method.structures import Observed, OrientedPoints
 
 __all__ = ["Places", "gather_places"]
 
@@ -66,6 +68,11 @@ class Places:
         pixels = torch.bincount(self.place, minlength=self.count).clamp_min(1)
         return sums / pixels.view(-1, *[1] * (values.ndim - 1))
 
+    def shared_points(self) -> SharedPoints:
+        """One point per place, the mean of the points that its pixels show, from which rays are traced."""
+        position, normal = self.mean(self.observed.position), self.mean(self.observed.normal)
+        return SharedPoints(position, safe_normalize(normal), self.observed, self.place)
+
 
 @torch.no_grad()
 def gather_places(
@@ -84,45 +91,53 @@ def gather_places(
         normal: unit normals of the places.
         views: maximum number of randomly drawn views per place; it bounds time and memory.
     """
-    to_scene = pixels.capture.normalisation.camera
-    cameras = [to_scene(view.camera) for view in pixels.views]
-    chosen = torch.rand(len(position), len(cameras), device=position.device).argsort(1).argsort(1) < views
-    parts = []
-    for number, camera in enumerate(cameras):
-        projected = project(camera, position)
-        column, row = projected.pixel.floor().long().unbind(-1)
-        within = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-        place = torch.nonzero(within & (projected.depth > 0) & chosen[:, number])[:, 0]
-        if not len(place):
-            continue
-        pixel = row[place] * camera.width + column[place]
-        batch = pixels.at(number, pixel)
-        hits = model.host.render(batch.rays)
-        distance = (hits.position - position[place]).norm(dim=-1)
-        hit_normal = model.shading_normals(hits.position, hits.normal)
-        same = (
-            hits.is_hit(model.config.shading.hit_share)
-            & (batch.mask > 0.5)
-            & pixels.valid(number)[pixel]
-            & (distance < MAX_OFFSET * projected.depth[place] / camera.fx)
-            & ((hit_normal * normal[place]).sum(-1) > SAME_NORMAL)
-            & ((hit_normal * -batch.directions).sum(-1) > MIN_COSINE)
-        )
-        linear = at_mean_exposure(model.gains, batch.color, batch.view, model.facts.response)
-        if model.facts.response == "srgb":
-            same = same & (batch.color.amax(-1) < CLIPPED)
-            linear = srgb_to_linear(linear)
-        rows = torch.nonzero(same)[:, 0]
-        observed = Observed(hits.position[rows], hit_normal[rows], -batch.directions[rows], linear[rows])
-        parts.append(Places(len(position), place[rows], torch.full_like(rows, number), observed))
+    drawn = torch.rand(len(position), len(pixels.views), device=position.device)
+    is_chosen = drawn.argsort(1).argsort(1) < views
+    points = OrientedPoints(position, normal)
+    parts = [
+        _in_view(model, pixels, points, number, is_chosen[:, number]) for number in range(len(pixels.views))
+    ]
+    parts = [part for part in parts if part is not None]
     if not parts:
         none = torch.zeros(0, dtype=torch.long, device=position.device)
         return Places(len(position), none, none, Observed(*[position[:0]] * 4))
-    observed = Observed(
-        position=torch.cat([part.observed.position for part in parts]),
-        normal=torch.cat([part.observed.normal for part in parts]),
-        wo=torch.cat([part.observed.wo for part in parts]),
-        pixel=torch.cat([part.observed.pixel for part in parts]),
-    )
     place, view = torch.cat([part.place for part in parts]), torch.cat([part.view for part in parts])
-    return Places(len(position), place, view, observed)
+    return Places(len(position), place, view, Observed.joined([part.observed for part in parts]))
+
+
+def _in_view(
+    model: NeilfModel,
+    pixels: PixelDataset,
+    points: OrientedPoints,
+    number: int,
+    is_chosen: Bool[Tensor, " P"],
+) -> Places | None:
+    """The pixels of one view that show the chosen points; None if none of these lies in the image."""
+    camera = pixels.capture.scene_camera(pixels.views[number])
+    projected = project(camera, points.position)
+    column, row = projected.pixel.floor().long().unbind(-1)
+    within = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    place = torch.nonzero(within & (projected.depth > 0) & is_chosen)[:, 0]
+    if not len(place):
+        return None
+    position, normal = points.position[place], points.normal[place]
+    pixel = row[place] * camera.width + column[place]
+    batch = pixels.at(number, pixel)
+    hits = model.host.render(batch.rays)
+    distance = (hits.position - position).norm(dim=-1)
+    hit_normal = model.shading_normals(hits.position, hits.normal)
+    same = (
+        hits.is_hit(model.config.shading.hit_share)
+        & (batch.mask > 0.5)
+        & pixels.valid(number)[pixel]
+        & (distance < MAX_OFFSET * projected.depth[place] / camera.fx)
+        & ((hit_normal * normal).sum(-1) > SAME_NORMAL)
+        & ((hit_normal * -batch.directions).sum(-1) > MIN_COSINE)
+    )
+    linear = at_mean_exposure(model.gains, batch.color, batch.view, model.facts.response)
+    if model.facts.response == "srgb":
+        same = same & (batch.color.amax(-1) < CLIPPED)
+        linear = srgb_to_linear(linear)
+    rows = torch.nonzero(same)[:, 0]
+    observed = Observed(hits.position[rows], hit_normal[rows], -batch.directions[rows], linear[rows])
+    return Places(len(points), place[rows], torch.full_like(rows, number), observed)

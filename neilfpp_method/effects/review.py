@@ -5,6 +5,8 @@ These are before training, before material init, before the joint stage, and aft
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 
 from neilfpp_method.data.pixels import PixelDataset
@@ -16,7 +18,7 @@ from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.material_search import search_materials, teach
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.metals import metals_evidence
-from neilfpp_method.effects.place_fit import place_transport
+from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.visibility import self_visibility
@@ -31,6 +33,7 @@ __all__ = [
     "MIN_PIXELS",
     "MIN_TRAIN_VIEWS",
     "SURFACE_PIXELS",
+    "LightReview",
     "improve_material",
     "light_places",
     "needs_surface",
@@ -101,45 +104,54 @@ def needs_surface(plan: Plan) -> bool:
     return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
 
 
+@dataclass(frozen=True)
+class LightReview:
+    """The result of `review_light`.
+
+    Attributes:
+        decisions: the new decisions.
+        first: the initial light; None if there are too few views or places, or if surfaces have no specular
+            lobe.
+    """
+
+    decisions: list[Decision]
+    first: FirstLight | None
+
+
 @torch.no_grad()
 def review_light(
     plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MAX_PIXELS
-) -> tuple[list[Decision], FirstLight | None]:
+) -> LightReview:
     """Decide on the specular lobe and on metals if these are open, and find an initial light.
 
     The model uses the settings of the plan afterwards. The arguments are those of `review_surface`, and
     `most`, the maximum number of pixels of the places; below `MIN_PIXELS` nothing is measured.
 
-    Returns:
-        The decisions, and the initial light; the light is None if there are too few views or places, or if
-        surfaces have no specular lobe.
     """
     if len(pixels.views) < MIN_TRAIN_VIEWS:
-        return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views"), None
+        return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views")
     if most < MIN_PIXELS:
-        return _not_measured(plan, step, "the budget leaves no time for it"), None
+        return _not_measured(plan, step, "the budget leaves no time for it")
     places = light_places(model, pixels, most)
     mode = model.training
     model.eval()
     typical, decisions = model.facts.median_radiance, []
     if len(places.place.unique()) < MIN_PLACES:
         model.train(mode)
-        return _not_measured(
-            plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views"
-        ), None
+        return _not_measured(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step))
         model.use(plan.config)
     first = None
     if model.lobe is not None:
-        transport = place_transport(places, model.lobe, model.scene)
+        data = PlaceData(places, place_transport(places, model.lobe, model.scene), typical)
         if plan.is_open("metals") and model.brdf.metals:
-            decisions.append(plan.decide("metals", metals_evidence(places, transport, typical), step))
+            decisions.append(plan.decide("metals", metals_evidence(data), step))
             model.use(plan.config)
-        first = find_first_light(places, transport, typical, model.brdf.metals)
+        first = find_first_light(data, model.brdf.metals)
     model.train(mode)
-    return decisions, first
+    return LightReview(decisions, first)
 
 
 @torch.no_grad()
@@ -242,14 +254,14 @@ def record_lamps(plan: Plan, evidence: Evidence | None, count: int, step: int) -
     return plan.decisions[-1:]
 
 
-def _not_measured(plan: Plan, step: int, reason: str) -> list[Decision]:
+def _not_measured(plan: Plan, step: int, reason: str) -> LightReview:
     """Record that the lobe and metals stay as they are, if they are open."""
     open_names = [name for name in ("long-tails", "metals") if plan.is_open(name)]
     decisions = [
         Decision(step, name, plan.is_on(name), "evidence", f"not measured: {reason}") for name in open_names
     ]
     plan.decisions += decisions
-    return decisions
+    return LightReview(decisions, None)
 
 
 def _rendered_surface(model: NeilfModel, pixels: PixelBatch) -> RenderedSurface:
@@ -262,6 +274,10 @@ def _rendered_surface(model: NeilfModel, pixels: PixelBatch) -> RenderedSurface:
         rows = torch.nonzero(hits.is_hit(model.config.shading.hit_share))[:, 0]
         hits, part = hits[rows], part[rows]
         normal = model.shading_normals(hits.position, hits.normal)
-        parts.append((hits.position, normal, -part.directions, part.color, hits.color))
-    joined = [torch.cat(column) for column in zip(*parts, strict=True)] or [pixels.color[:0]] * 5
-    return RenderedSurface(Observed(*joined[:4]), joined[4])
+        observed = Observed(hits.position, normal, -part.directions, part.color)
+        parts.append(RenderedSurface(observed, hits.color))
+    if not parts:
+        return RenderedSurface(Observed(*[pixels.color[:0]] * 4), pixels.color[:0])
+    return RenderedSurface(
+        Observed.joined([part.observed for part in parts]), torch.cat([part.radiance for part in parts])
+    )

@@ -165,8 +165,7 @@ def material_deviation(
             sightings = block_sightings[rows.start - block : rows.stop - block]
             parts.append(_deviation(model, evidence, position[rows], normal[rows], sightings))
             on_progress(rows.stop / len(position))
-    deviation = Deviation(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Deviation)))
-    return _smoothed(deviation, position, normal)
+    return _smoothed(Deviation.joined(parts), position, normal)
 
 
 def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
@@ -203,7 +202,7 @@ def surface_at_pixels(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"
         pixels: row-major pixel indices.
     """
     camera = next(v.camera for v in run.capture.views if v.name == view.name)
-    rays = camera_rays(run.capture.normalisation.camera(camera))[torch.from_numpy(pixels)]
+    rays = camera_rays(run.capture.normalization.camera(camera))[torch.from_numpy(pixels)]
     depth = torch.from_numpy(view.maps["depth"].reshape(-1, 1)[pixels])
     normal = torch.from_numpy(view.maps["normal"].reshape(-1, 3)[pixels])
     points = OrientedPoints(rays.origins + depth * rays.directions, normal)

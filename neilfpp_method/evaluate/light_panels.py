@@ -122,7 +122,7 @@ def _true_points(run: Run, directions: Float[np.ndarray, "H W 3"]) -> list[Light
 def _rendered_points(run: Run, rendered: RenderedView) -> list[LightPoint]:
     """Surface points of a rendered view, spread from top to bottom; empty if it shows no surface."""
     view = next(view for view in run.capture.views if view.name == rendered.name)
-    rays = camera_rays(run.capture.normalisation.camera(view.camera))
+    rays = camera_rays(run.capture.scene_camera(view))
     hits = np.flatnonzero(rendered.surface_mask)
     if not len(hits):
         return []

@@ -14,6 +14,7 @@ from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.confidence import gather_evidence, material_deviation, surface_at_pixels
 from neilfpp_method.evaluate.views import KnownView, RenderedView, mean_observed_color, surface_points
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear, tone_map
+from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
 __all__ = [
@@ -127,9 +128,10 @@ def confidence_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     rows = [np.flatnonzero(known.mask & view.surface_mask) for view, known in pairs]
     step = max(1, sum(map(len, rows)) // CONFIDENCE_PIXELS)
     rows = [r[::step] for r in rows]
-    points = [surface_at_pixels(run, view, r) for (view, _), r in zip(pairs, rows, strict=True)]
-    position, normal = (torch.cat([getattr(p, name) for p in points]) for name in ("position", "normal"))
-    deviation = material_deviation(run.model, gather_evidence(run), position, normal)
+    points = OrientedPoints.joined(
+        [surface_at_pixels(run, view, r) for (view, _), r in zip(pairs, rows, strict=True)]
+    )
+    deviation = material_deviation(run.model, gather_evidence(run), points.position, points.normal)
 
     figures = {}
     for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):

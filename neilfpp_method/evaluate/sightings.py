@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -50,7 +50,7 @@ class TrainingViews:
     def __init__(self, capture: Capture, device: torch.device | str = "cpu") -> None:
         self.hdr = capture.hdr
         self.pixels = PixelDataset(capture, capture.train_views, device)
-        self.cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
+        self.cameras = [capture.scene_camera(view) for view in capture.train_views]
         self.centers = torch.stack(
             [torch.as_tensor(camera.c2w[:, 3], dtype=torch.float32) for camera in self.cameras]
         ).to(device)
@@ -64,9 +64,7 @@ class TrainingViews:
             view = self.pixels.view(i, gradients=False)
             rows = torch.nonzero((view.mask > 0.5) & self.pixels.valid(i))[:, 0]
             batches.append(view[rows[:: max(1, math.ceil(len(rows) / each))]])
-        return PixelBatch(
-            **{f.name: torch.cat([getattr(batch, f.name) for batch in batches]) for f in fields(PixelBatch)}
-        )
+        return PixelBatch.joined(batches)
 
     @torch.no_grad()
     def sightings(

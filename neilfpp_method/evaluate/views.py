@@ -61,7 +61,7 @@ def render_view(
     """
     view = run.capture.views[view_index]
     device = next(run.model.parameters()).device
-    rays = camera_rays(run.capture.normalisation.camera(view.camera))
+    rays = camera_rays(run.capture.scene_camera(view))
     parts = -(-len(rays) // EVAL_RAYS)
     combined: dict[str, Tensor] = {}
     for k in range(parts):
@@ -199,7 +199,7 @@ VISIBLE = 0.02
 
 def surface_points(capture: Capture, known: KnownView) -> Float[Tensor, "P 3"]:
     """Points of the true surface at the masked pixels of a view with true depth, scene frame."""
-    camera = capture.normalisation.camera(known.view.camera)
+    camera = capture.scene_camera(known.view)
     rays = camera_rays(camera)[torch.from_numpy(known.mask).reshape(-1)]
     cosine = rays.directions @ torch.as_tensor(camera.w2c[2, :3], dtype=rays.directions.dtype)
     return rays.origins + rays.directions * (torch.from_numpy(known.depth[known.mask]) / cosine)[:, None]
@@ -224,7 +224,7 @@ def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float
     pixels = _file_values(capture, views)
     total, count = torch.zeros_like(points), torch.zeros(len(points), 1)
     for i, view in enumerate(views):
-        projected = project(capture.normalisation.camera(view.camera), points)
+        projected = project(capture.scene_camera(view), points)
         index = pixel_index(projected, view.camera)
         same_depth = (truth.depth(view)[index] - projected.depth).abs() <= VISIBLE
         visible = (index >= 0) & pixels.valid(i)[index] & same_depth

@@ -89,7 +89,7 @@ def lamps_in_world(run: Run) -> list[dict[str, Any]]:
     square of length.
     """
     lamps = run.model.lamps
-    frame = run.capture.normalisation
+    frame = run.capture.normalization
     used = slice(lamps.count)
     positions = frame.to_world(lamps.position[used].double()).tolist()
     axes = [axis if any(axis) else None for axis in lamps.axis[used].tolist()]
@@ -121,4 +121,4 @@ def _write_probes(run: Run, out: Path, count: int) -> int:
 
 
 def _in_world(run: Run, position: Float[Tensor, " 3"]) -> list[float]:
-    return run.capture.normalisation.to_world(position.double()).tolist()
+    return run.capture.normalization.to_world(position.double()).tolist()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -162,7 +161,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
         columns |= zip(("red", "green", "blue", "alpha"), (*color.T, opaque), strict=True)
         columns["roughness"] = material.roughness[:, 0].cpu().numpy()
         columns["metallic"] = material.metallic[:, 0].cpu().numpy()
-    mesh.vertices = run.capture.normalisation.to_world(position.double()).cpu().numpy()
+    mesh.vertices = run.capture.normalization.to_world(position.double()).cpu().numpy()
     write_ply(path, np.array(mesh.vertices), columns, np.array(mesh.faces))
     return mesh
 
@@ -171,9 +170,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
 def materials_in_parts(run: Run, position: Float[Tensor, "N 3"]) -> Material:
     """Evaluate the material at any number of points of the scene frame, in batches."""
     parts = [run.model.materials(part) for part in position.split(POINTS_AT_ONCE)]
-    return Material(
-        **{f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Material)}
-    )
+    return Material.joined(parts)
 
 
 def _sparse_grid(

@@ -30,10 +30,7 @@ def spread_over_surface(run: Run, count: int) -> OrientedPoints:
         UserError: no training view sees a surface.
     """
     device = next(run.model.parameters()).device
-    parts = list(_visible_points(run, device))
-    points = OrientedPoints(
-        torch.cat([part.position for part in parts]), torch.cat([part.normal for part in parts])
-    )
+    points = OrientedPoints.joined(list(_visible_points(run, device)))
     if not len(points):
         raise UserError(f"{run.path}: no training view sees a surface", "train the run for longer")
     return points[spread(points, count)]
@@ -76,7 +73,7 @@ def _visible_points(run: Run, device: torch.device) -> Iterator[OrientedPoints]:
     views = run.capture.train_views
     generator = torch.Generator().manual_seed(0)
     for view in views:
-        rays = camera_rays(run.capture.normalisation.camera(view.camera))
+        rays = camera_rays(run.capture.scene_camera(view))
         pixels = torch.randperm(len(rays), generator=generator)[: -(-CANDIDATES // len(views))]
         hits = run.model.host.render(rays[pixels].to(device))
         is_hit = hits.is_hit(run.config.shading.hit_share)

@@ -85,13 +85,23 @@ class Lamps(nn.Module):
             self.axis[: self.count] = axis[: self.count]
         self.intensity.zero_()[: self.count] = intensity[: self.count]
 
+    @property
+    def lit_places(self) -> LampPlaces:
+        """Positions and axes of the lit lamps."""
+        return LampPlaces(self.position[: self.count], self.axis[: self.count])
+
+    @property
+    def lit_intensity(self) -> Float[Tensor, "K 3"]:
+        """Intensities of the lit lamps."""
+        return self.intensity[: self.count]
+
     def rays_from(self, x: Float[Tensor, "N 3"]) -> LampRays:
         """Rays from points towards the centre of each lit lamp."""
         return rays_towards(x, self.position[: self.count], self.axis[: self.count], self.radius)
 
     def radiance(self) -> Float[Tensor, "K 3"]:
         """Radiance of the lit lamps on their axes: intensity over the area of the disc."""
-        return self.intensity[: self.count] / (math.pi * self.radius**2)
+        return self.lit_intensity / (math.pi * self.radius**2)
 
     def arriving(self, rays: LampRays) -> Float[Tensor, "N K 3"]:
         """Radiance along rays from the lit lamps, without occlusion."""

@@ -9,12 +9,12 @@ from typing import Any
 
 from neilfpp_method.health.cases import (
     Finding,
+    Health,
     few_light_points,
     material_findings,
     nothing_shaded,
     skipped_steps,
     surface_findings,
-    verdict_of,
 )
 from neilfpp_method.health.measure import SurfaceMeasurement, measure_surface
 from neilfpp_method.model import NeilfModel
@@ -75,7 +75,12 @@ class Watch:
                 self.warn(finding.line())
             self.findings[finding.case] = before.get(finding.case, finding)
 
+    @property
+    def health(self) -> Health:
+        """The verdict that follows from the findings so far."""
+        return Health.of(self.findings.values())
+
     def record(self) -> dict[str, Any]:
         """The content of `health.json`."""
         findings = [dataclasses.asdict(finding) for finding in self.findings.values()]
-        return {"format": FORMAT, "verdict": verdict_of(self.findings.values()), "findings": findings}
+        return {"format": FORMAT, "verdict": self.health.verdict, "findings": findings}

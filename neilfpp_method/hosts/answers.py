@@ -21,7 +21,7 @@ A ray without opacity misses, so its position is not read: many hosts return an 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import torch
@@ -34,7 +34,7 @@ from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
-__all__ = ["Rendered", "as_hits", "function_hits", "in_precision", "no_hits"]
+__all__ = ["Rendered", "as_hits", "function_hits", "no_hits"]
 
 Rendered = SurfaceHits | Mapping[str, Tensor] | Sequence[Tensor]
 """Rendered outputs of a host, in any form that this module reads."""
@@ -89,11 +89,6 @@ def function_hits(name: str, rays: RayBatch, answer: Any) -> SurfaceHits:
     position = torch.where(hit[:, None], position, rays.origins.to(position.dtype))
     share = hit.to(color.dtype)
     return SurfaceHits(color, position, torch.where(hit[:, None], normal, 0.0), share, share)
-
-
-def in_precision(hits: SurfaceHits, dtype: torch.dtype) -> SurfaceHits:
-    """Convert hits to a floating-point type, keeping gradients."""
-    return replace(hits, **{f.name: getattr(hits, f.name).to(dtype) for f in fields(hits)})
 
 
 def no_hits(rays: RayBatch) -> SurfaceHits:

@@ -29,8 +29,8 @@ __all__ = [
     "LimitsSurfaceWidth",
     "PredictsMisses",
     "ReadsOutputs",
-    "Regularised",
-    "RegularisedHits",
+    "Regularized",
+    "RegularizedHits",
     "SmoothsNormals",
     "StartsFromShape",
     "TracesLight",
@@ -64,7 +64,7 @@ class ImageHost(Protocol):
 
 
 @dataclass(frozen=True)
-class RegularisedHits:
+class RegularizedHits:
     """Hits of rendered rays, and the host's own losses at the points that rendering evaluated."""
 
     hits: SurfaceHits
@@ -72,10 +72,10 @@ class RegularisedHits:
 
 
 @runtime_checkable
-class Regularised(Protocol):
+class Regularized(Protocol):
     """A host with losses of its own. Without it only the losses of the method train the geometry."""
 
-    def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+    def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         """As `render`, with those of the named losses that the host has; others are not computed."""
         ...
 

@@ -44,8 +44,8 @@ CAPABILITIES = (
         reported=True,
     ),
     Capability(
-        "render_regularised",
-        base.Regularised,
+        "render_regularized",
+        base.Regularized,
         "training steps that train the host",
         "model",
         "the geometry has no losses of the host's own",

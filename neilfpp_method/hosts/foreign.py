@@ -10,13 +10,12 @@ import logging
 from collections.abc import Collection
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits, in_precision, no_hits
-from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularisedHits, TracesLight
-from neilfpp_method.hosts.image import rays_like
+from neilfpp_method.hosts.answers import as_hits, no_hits
+from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.settings.types import NeilfConfig
@@ -84,8 +83,8 @@ class ForeignHost(nn.Module):
                 object.__setattr__(self, capability, getattr(host, capability))
         if proxy is not None:
             object.__setattr__(self, "scene_light", proxy.scene_light)
-        if hasattr(host, "render_regularised"):
-            object.__setattr__(self, "render_regularised", self._render_regularised)
+        if hasattr(host, "render_regularized"):
+            object.__setattr__(self, "render_regularized", self._render_regularized)
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Hits by the host, or by the proxy if the host cannot render rays that start at a surface.
@@ -114,8 +113,8 @@ class ForeignHost(nn.Module):
             )
         return no_hits(rays) if len(rays) == 0 else self.read(rays, self.inner.render(rays))
 
-    def image_hits(self, camera: Camera, like: Tensor) -> tuple[RayBatch, SurfaceHits]:
-        """The rays of all pixels of a camera, and the host's hits.
+    def image_hits(self, camera: Camera, rays: RayBatch) -> SurfaceHits:
+        """The hits of all pixels of a camera, whose rays are given, by a host that draws whole images.
 
         Raises:
             UserError: the host has no `render_image`.
@@ -124,8 +123,7 @@ class ForeignHost(nn.Module):
             raise UserError(
                 f"{self.name} has no render_image(camera)", "give rays: data.views.camera_rays(camera)"
             )
-        rays = rays_like(camera, like)
-        return rays, self.read(rays, self.inner.render_image(camera))
+        return self.read(rays, self.inner.render_image(camera))
 
     def read(self, rays: RayBatch, rendered: object) -> SurfaceHits:
         """Convert what the host rendered for these rays, in any form that `hosts.answers` reads.
@@ -143,11 +141,11 @@ class ForeignHost(nn.Module):
             self.proxy.explore(self.render, rays, hits)
         self.proxy.observe(rays, hits)
 
-    def _render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+    def _render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         if len(batch) == 0:
-            return RegularisedHits(no_hits(batch.rays), {})
-        rendered = self.inner.render_regularised(batch, names)
-        return RegularisedHits(self.read(batch.rays, rendered.hits), rendered.terms)
+            return RegularizedHits(no_hits(batch.rays), {})
+        rendered = self.inner.render_regularized(batch, names)
+        return RegularizedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
     def _precise(self, rays: RayBatch, hits: SurfaceHits) -> SurfaceHits:
         if hits.position.dtype in COARSE and not self.warned_of_precision:
@@ -159,4 +157,4 @@ class ForeignHost(nn.Module):
                 hits.position.dtype,
                 digits,
             )
-        return in_precision(hits, rays.origins.dtype)
+        return hits.map(lambda t: t.to(rays.origins.dtype))

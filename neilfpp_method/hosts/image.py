@@ -10,8 +10,10 @@ Example:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.views import Camera, camera_rays
@@ -94,22 +96,27 @@ def depth_normals(position: Float[Tensor, "H W 3"], eye: Float[Tensor, " 3"]) ->
     zero if both neighbours along an axis lie on another surface.
     """
     distance = (position - eye).norm(dim=-1)
-    right, right_ok = _nearer_step(position, distance, 1)
-    down, down_ok = _nearer_step(position, distance, 0)
-    normal = safe_normalize(torch.linalg.cross(right, down))
+    right, down = (_nearer_step(position, distance, axis) for axis in (1, 0))
+    normal = safe_normalize(torch.linalg.cross(right.offset, down.offset))
     towards = ((eye - position) * normal).sum(-1, keepdim=True)
-    return torch.where(towards < 0, -normal, normal) * (right_ok & down_ok)[..., None]
+    return torch.where(towards < 0, -normal, normal) * (right.on_one_surface & down.on_one_surface)[..., None]
 
 
-def _nearer_step(
-    position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int
-) -> tuple[Tensor, Tensor]:
-    """The difference to the neighbour of closer depth along an axis, and whether both are on one surface."""
+@dataclass(frozen=True)
+class _Step:
+    """From each pixel to a neighbour: the offset in space, and whether both show one surface."""
+
+    offset: Float[Tensor, "H W 3"]
+    on_one_surface: Bool[Tensor, "H W"]
+
+
+def _nearer_step(position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"], axis: int) -> _Step:
+    """The step to the neighbour of closer depth along an axis."""
     forward, backward = (position.roll(-1, axis) - position), (position - position.roll(1, axis))
     rise = (distance.roll(-1, axis) - distance).abs()
     edge = torch.arange(position.shape[axis], device=position.device).view(-1, *([1] * (1 - axis)))
     rise = torch.where(edge == position.shape[axis] - 1, torch.inf, rise)
     fall = (distance - distance.roll(1, axis)).abs()
     fall = torch.where(edge == 0, torch.inf, fall)
-    step = torch.where((rise <= fall)[..., None], forward, backward)
-    return step, torch.minimum(rise, fall) < JUMP * distance
+    offset = torch.where((rise <= fall)[..., None], forward, backward)
+    return _Step(offset, torch.minimum(rise, fall) < JUMP * distance)

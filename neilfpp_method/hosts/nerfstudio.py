@@ -19,10 +19,10 @@ from nerfstudio.models.base_model import Model
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.answers import no_hits
-from neilfpp_method.hosts.base import RegularisedHits
+from neilfpp_method.hosts.base import RegularizedHits
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, PixelBatch, RayBatch, SurfaceHits
@@ -38,7 +38,7 @@ COLOR_CODED = ("pred_normals", "normals")
 """Outputs that hold normals as colours (n + 1)/2."""
 PIXEL_AREA = 1e-6
 """Area of a pixel at distance 1, which cone-casting samplers need: that of an image of 1000 pixels width."""
-SAME_FRAME = Normalisation(1.0, (0.0, 0.0, 0.0))
+SAME_FRAME = Normalization(1.0, (0.0, 0.0, 0.0))
 
 Outputs = Mapping[str, Tensor]
 
@@ -56,7 +56,7 @@ class NerfstudioHost(nn.Module):
             scene.
         frame: transformation between the model's frame (as world frame) and the scene frame, in which the
             object lies in the unit sphere.
-        own_losses: whether `render_regularised` adds the term `own`: all losses of the model except
+        own_losses: whether `render_regularized` adds the term `own`: all losses of the model except
             `rgb_loss`, to be weighted by 1. False if the model is trained elsewhere or not at all.
     """
 
@@ -66,7 +66,7 @@ class NerfstudioHost(nn.Module):
         *,
         response: str = "srgb",
         radiance_scale: float = 1.0,
-        frame: Normalisation = SAME_FRAME,
+        frame: Normalization = SAME_FRAME,
         own_losses: bool = False,
     ) -> None:
         super().__init__()
@@ -93,14 +93,14 @@ class NerfstudioHost(nn.Module):
         first_view = torch.zeros_like(rays.origins[:, 0], dtype=torch.long)
         return self.read_outputs(rays, self._outputs(rays, first_view))
 
-    def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+    def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         """As `render`, with the loss `eikonal` or `own` in training, if the model has it.
 
         `eikonal` uses the gradients that a `SurfaceModel` outputs in training. With `own_losses` the term
         `own`, with the model's own weights, replaces it.
         """
         if len(batch) == 0:
-            return RegularisedHits(no_hits(batch.rays), {})
+            return RegularizedHits(no_hits(batch.rays), {})
         outputs = self._outputs(batch.rays, batch.view)
         terms = {}
         if torch.is_grad_enabled() and self.training:
@@ -108,7 +108,7 @@ class NerfstudioHost(nn.Module):
                 terms[OWN_LOSSES] = self._own_losses(outputs, batch)
             elif "eikonal" in names and "eik_grad" in outputs:
                 terms["eikonal"] = losses.eikonal(outputs["eik_grad"].reshape(-1, 3))
-        return RegularisedHits(self.read_outputs(batch.rays, outputs), terms)
+        return RegularizedHits(self.read_outputs(batch.rays, outputs), terms)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """All parameters that the model trains, as `geometry`: its fields hold shape and colour together."""
@@ -139,9 +139,8 @@ class NerfstudioHost(nn.Module):
             outputs, NORMALS, "switch its normals on (nerfacto: predict_normals=True), or use a surface model"
         )
         normal = 2.0 * outputs[name] - 1.0 if name in COLOR_CODED else outputs[name]
-        opacity = outputs[self._first(outputs, ("accumulation",), "have it output the sum of its weights")][
-            :, 0
-        ]
+        weights = self._first(outputs, ("accumulation",), "have it output the sum of its weights")
+        opacity = outputs[weights][:, 0]
         drawn = outputs[self._first(outputs, ("rgb",), "use a model that renders a color")]
         linear = srgb_to_linear(drawn) if self.response == "srgb" else drawn
         return SurfaceHits(
@@ -163,8 +162,8 @@ class NerfstudioHost(nn.Module):
         pixels = {"image": self._as_drawn(batch.color)}
         metrics = self.model.get_metrics_dict(outputs, pixels)
         model_losses = self.model.get_loss_dict(outputs, pixels, metrics)
-        regularisers = [value for name, value in model_losses.items() if not name.startswith("rgb_loss")]
-        return LossTerm(torch.stack(regularisers).sum() if regularisers else batch.color.new_zeros(()))
+        regularizers = [value for name, value in model_losses.items() if not name.startswith("rgb_loss")]
+        return LossTerm(torch.stack(regularizers).sum() if regularizers else batch.color.new_zeros(()))
 
     def _as_drawn(self, color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Pixels in the units of the model's colour. Pixels and model have the same response."""

@@ -12,9 +12,9 @@ few dozen steps.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -86,6 +86,26 @@ class ObservedRays:
     distance: Float[Tensor, " N"]
 
 
+@dataclass(frozen=True)
+class RenderedRays:
+    """Rays, and what the host rendered for them."""
+
+    rays: RayBatch
+    hits: SurfaceHits
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> RenderedRays:
+        """Replace every tensor by `function(tensor)`."""
+        return RenderedRays(self.rays.map(function), self.hits.map(function))
+
+
+@dataclass(frozen=True)
+class CubeEntry:
+    """The distances at which rays enter the cube of the grid, 0 from inside, and whether they do."""
+
+    distance: Float[Tensor, " P"]
+    passes: Bool[Tensor, " P"]
+
+
 class SurfaceProxy(nn.Module):
     """The newest points of a surface, and a grid made from them. A checkpoint holds only the points.
 
@@ -108,7 +128,7 @@ class SurfaceProxy(nn.Module):
         self.points = Ring(POINTS, 10)
         self.steps = 0
         self._radiance = radiance
-        self._pending: list[tuple[RayBatch, SurfaceHits]] = []
+        self._pending: list[RenderedRays] = []
         self._surface: FusedSurface | None = None
         self._report: ProxyReport | None = None
 
@@ -120,7 +140,7 @@ class SurfaceProxy(nn.Module):
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> SurfaceProxy:
         """Convert the module: `nn.Module` calls this for `to`, `double` and `cuda`, on any parent as well."""
         super()._apply(fn, recurse)
-        self._pending = [(_converted(rays, fn), _converted(hits, fn)) for rays, hits in self._pending]
+        self._pending = [rendered.map(fn) for rendered in self._pending]
         # The grid is rebuilt from the converted points at its next use.
         self._surface = None
         return self
@@ -131,7 +151,7 @@ class SurfaceProxy(nn.Module):
     def observe(self, rays: RayBatch, hits: SurfaceHits) -> None:
         """Add the camera rays and hits of a training step, and refresh the grid when it is due."""
         self.steps += 1
-        self._pending.append((rays.to(rays.origins.device), hits.detach()))
+        self._pending.append(RenderedRays(rays, hits.detach()))
         if self.steps % EVERY == 0 or (self.steps < EVERY and self.steps & (self.steps - 1) == 0):
             self.refresh()
 
@@ -152,7 +172,7 @@ class SurfaceProxy(nn.Module):
             targets = targets + SPREAD * (2 * torch.rand_like(targets) - 1)
             new_rays = RayBatch(origins, safe_normalize(targets - origins))
             new_hits = render(new_rays).detach()
-            self._pending.append((new_rays, new_hits))
+            self._pending.append(RenderedRays(new_rays, new_hits))
             hit_points = torch.cat((hit_points, new_hits.position[new_hits.is_hit(self.hit_share)]))
         self.refresh()
 
@@ -161,7 +181,8 @@ class SurfaceProxy(nn.Module):
         """Measure the error on the rays since the last refresh, add them, and rebuild the grid."""
         if not self._pending:
             return
-        rays, hits = (_joined(parts) for parts in zip(*self._pending, strict=True))
+        rays = RayBatch.joined([rendered.rays for rendered in self._pending])
+        hits = SurfaceHits.joined([rendered.hits for rendered in self._pending])
         self._pending.clear()
         hit = hits.is_hit(self.hit_share) & (hits.normal.norm(dim=-1) > 0.5)
         distance = torch.where(hit, (hits.position - rays.origins).norm(dim=-1), torch.inf)
@@ -284,32 +305,31 @@ class SurfaceProxy(nn.Module):
     def _trace(self, rays: RayBatch) -> GridHits:
         """Trace rays, which may start outside of the cube, to the surface of the grid."""
         grid = self._known_surface().distance
-        enter, passes = self._entry(rays)
-        start = rays.origins + enter[:, None] * rays.directions
+        entry = self._entry(rays)
+        start = rays.origins + entry.distance[:, None] * rays.directions
         found = trace_grid(grid, self.radius, start, rays.directions)
-        hit = found.hit & passes
+        hit = found.hit & entry.passes
         # Tracing ends a quarter cell above the surface; a Newton step covers the rest.
         rows = torch.nonzero(hit)[:, 0]
         directions = rays.directions[rows]
         place = start[rows] + found.distance[rows, None] * directions
         cosine = -(grid_normal(grid, self.radius, place) * directions).sum(-1)
         rest = (look_up(grid, self.radius, place) / cosine.clamp_min(GRAZING)).clamp(-self.cell, self.cell)
-        return GridHits((enter + found.distance).index_add(0, rows, rest), hit)
+        return GridHits((entry.distance + found.distance).index_add(0, rows, rest), hit)
 
-    def _entry(self, rays: RayBatch) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
-        """The distance at which rays enter the cube (0 from inside), and whether they do."""
+    def _entry(self, rays: RayBatch) -> CubeEntry:
         direction = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
         ends = torch.stack(
             ((-self.radius - rays.origins) / direction, (self.radius - rays.origins) / direction)
         )
         near, far = ends.amin(0).amax(-1).clamp_min(0.0), ends.amax(0).amin(-1)
-        return torch.where(near > 0, near + 1e-4 * self.radius, near), far > near
+        return CubeEntry(torch.where(near > 0, near + 1e-4 * self.radius, near), far > near)
 
     # -------------------------------------------------------------------------------------------- checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of observed steps, and the rays since the last refresh, for checkpoints."""
-        pending = [{**_tensors(rays), **_tensors(hits)} for rays, hits in self._pending]
+        pending = [{**vars(rendered.rays), **vars(rendered.hits)} for rendered in self._pending]
         return {"steps": self.steps, "pending": pending}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -317,27 +337,10 @@ class SurfaceProxy(nn.Module):
         self.steps, self._surface, self._report = state["steps"], None, None
         like = self.points.rows
         self._pending = [
-            tuple(_converted(_made(kind, tensors), lambda t: t.to(like)) for kind in (RayBatch, SurfaceHits))
+            RenderedRays(_made(RayBatch, tensors), _made(SurfaceHits, tensors)).map(lambda t: t.to(like))
             for tensors in state["pending"]
         ]
 
 
-Part = TypeVar("Part", RayBatch, SurfaceHits)
-
-
-def _joined(parts: Sequence[Part]) -> Part:
-    """All parts as one batch."""
-    return type(parts[0])(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(parts[0])))
-
-
-def _tensors(part: RayBatch | SurfaceHits) -> dict[str, Tensor]:
-    return {f.name: getattr(part, f.name) for f in fields(part)}
-
-
-def _converted(part: Part, fn: Callable[[Tensor], Tensor]) -> Part:
-    """The same structure with `fn` applied to each tensor, all of which are floating point."""
-    return type(part)(**{name: fn(tensor) for name, tensor in _tensors(part).items()})
-
-
-def _made(kind: type[Part], tensors: Mapping[str, Tensor]) -> Part:
+def _made(kind: type[RayBatch | SurfaceHits], tensors: Mapping[str, Tensor]) -> RayBatch | SurfaceHits:
     return kind(**{f.name: tensors[f.name] for f in fields(kind)})

@@ -22,7 +22,7 @@ from neilfpp_method.hosts.base import HasStages, Host
 from neilfpp_method.hosts.function import CallableHost, RenderFunction
 from neilfpp_method.hosts.outputs import check_normals, host_name
 from neilfpp_method.hosts.testing_case import HIT_SHARE, Case, ContractBroken, Modes, render_checked
-from neilfpp_method.hosts.testing_conduct import CONDUCT_CHECKS
+from neilfpp_method.hosts.testing_conduct import BASIC_CHECKS, CONDUCT_CHECKS
 from neilfpp_method.hosts.testing_geometry import GEOMETRY_CHECKS
 from neilfpp_method.schedule import STAGES
 from neilfpp_method.structures import RayBatch, SurfaceHits
@@ -73,7 +73,7 @@ def check_host(
         parameters = [p for module in modules for p in module.parameters()]
     parameters = [p for p in parameters if p.requires_grad]
     name = host_name(host)
-    copy = rays.origins.clone(), rays.directions.clone()
+    copy = rays.map(Tensor.clone)
     before = Modes.of(modules, parameters)
     try:
         hits = render_checked(host, rays)
@@ -82,9 +82,8 @@ def check_host(
         hit = hits.is_hit(HIT_SHARE).detach()
         now = partial(Modes.of, modules, parameters)
         case = Case(host, name, before, now, rays, parameters, trains_geometry, hits, hit)
-        case.require(
-            torch.equal(copy[0], rays.origins) and torch.equal(copy[1], rays.directions), "changes its input"
-        )
+        unchanged = torch.equal(copy.origins, rays.origins) and torch.equal(copy.directions, rays.directions)
+        case.require(unchanged, "changes its input")
         _run(case)
     finally:
         before.restore(modules, parameters)
@@ -216,10 +215,10 @@ CHECKS: tuple[Callable[[Case], None], ...] = (
     _normals,
     _positions,
     _colors,
-    *CONDUCT_CHECKS[:4],
+    *BASIC_CHECKS,
     *GEOMETRY_CHECKS,
     _misses,
-    *CONDUCT_CHECKS[4:],
+    *CONDUCT_CHECKS,
     _gradients_flow,
     _gradients_stop,
 )

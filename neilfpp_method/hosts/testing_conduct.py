@@ -10,7 +10,7 @@ from torch import Tensor
 from neilfpp_method.hosts.testing_case import Case
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
-__all__ = ["CONDUCT_CHECKS"]
+__all__ = ["BASIC_CHECKS", "CONDUCT_CHECKS"]
 
 MAX_CHANGE = 0.005
 """Largest permitted median change of positions between two calls, in scene units. The width of the soft layer
@@ -118,13 +118,7 @@ def _next_draw(case: Case, seed: int) -> Tensor:
         return torch.rand(4)
 
 
-CONDUCT_CHECKS = (
-    _leaves_modes_alone,
-    _one_ray,
-    _one_camera,
-    _repeatable,
-    _alone_as_together,
-    _same_without_gradient,
-    _keeps_what_it_gave,
-    _leaves_randomness_alone,
-)
+BASIC_CHECKS = (_leaves_modes_alone, _one_ray, _one_camera, _repeatable)
+"""Checks of what the checks of the geometry rely on: any rays can be rendered, repeatedly."""
+CONDUCT_CHECKS = (_alone_as_together, _same_without_gradient, _keeps_what_it_gave, _leaves_randomness_alone)
+"""All other checks of the behaviour."""

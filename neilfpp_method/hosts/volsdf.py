@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields.sdf import SdfField, SdfSample
-from neilfpp_method.hosts.base import RegularisedHits
+from neilfpp_method.hosts.base import RegularizedHits
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.facts import SceneFacts
@@ -55,12 +55,20 @@ class March:
 
 
 @dataclass(frozen=True)
-class Places:
+class RegularizerInputs:
     """Inputs of the regularisers: ∇G for L_Eik, G for L_surf, and points for L_Hess."""
 
     gradient: Float[Tensor, "A 3"]
     distance: Float[Tensor, " B"]
     curved: Float[Tensor, "C 3"]
+
+
+@dataclass(frozen=True)
+class EvaluationSpace:
+    """Empty space of a G that is not being trained, and the versions of the parameters that G had then."""
+
+    versions: list[tuple[int, int]]
+    space: EmptySpace
 
 
 class VolSdfHost(nn.Module):
@@ -106,9 +114,8 @@ class VolSdfHost(nn.Module):
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
-        # A grid for evaluation, with the versions of the parameters of G that it was sampled from. It is not
-        # in checkpoints.
-        self._eval_space: tuple[list[tuple[int, int]], EmptySpace] | None = None
+        # Made at first use in evaluation; not in checkpoints.
+        self._evaluation_space: EvaluationSpace | None = None
 
     # -------------------------------------------------------------------------------------- the host contract
 
@@ -124,7 +131,7 @@ class VolSdfHost(nn.Module):
             return self._march(rays).hits
         return self._render_visible_parts(rays)
 
-    def render_regularised(self, batch: PixelBatch, names: Collection[str]) -> RegularisedHits:
+    def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         """As `render`, with those of the losses eikonal, hessian, surface, point_cloud and mask in
         `names`.
         """
@@ -134,7 +141,7 @@ class VolSdfHost(nn.Module):
                 self.grid_age += 1
             if self.empty_space is not None:
                 self.empty_space.moved()
-        return RegularisedHits(march.hits, self._regularisers(march, batch, names))
+        return RegularizedHits(march.hits, self._regularizers(march, batch, names))
 
     def surface_width(self) -> Float[Tensor, ""]:
         """β, the scale of the Laplace density, without gradient."""
@@ -240,10 +247,11 @@ class VolSdfHost(nn.Module):
     def _render_visible_parts(self, rays: RayBatch) -> SurfaceHits:
         """Render a field that is not being trained; rays that miss the scene cost only grid look-ups."""
         versions = [(id(p), p._version) for p in self.sdf_field.parameters()]
-        if self._eval_space is None or self._eval_space[0] != versions:
-            self._eval_space = versions, EmptySpace(self.config.volume.radius).to(rays.origins)
+        if self._evaluation_space is None or self._evaluation_space.versions != versions:
+            space = EmptySpace(self.config.volume.radius).to(rays.origins)
+            self._evaluation_space = EvaluationSpace(versions, space)
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
-        span = self._eval_space[1].may_show(self.sdf, rays, interval, self.surface_width())
+        span = self._evaluation_space.space.may_show(self.sdf, rays, interval, self.surface_width())
         zeros = torch.zeros_like(interval.far)
         missed = SurfaceHits(
             color=self._background(rays, torch.ones_like(zeros), at_far=torch.zeros_like(rays.origins)),
@@ -257,13 +265,7 @@ class VolSdfHost(nn.Module):
             return missed
         part = Interval(span.interval.near[rows], span.interval.far[rows])
         visible = self._march(rays[rows], part).hits
-        return replace(
-            missed,
-            **{
-                f.name: getattr(missed, f.name).index_put((rows,), getattr(visible, f.name))
-                for f in fields(SurfaceHits)
-            },
-        )
+        return missed.map_named(lambda name, values: values.index_put((rows,), getattr(visible, name)))
 
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
         """Sample and blend rays; `part` is the part of each ray to sample, if it is known."""
@@ -328,15 +330,15 @@ class VolSdfHost(nn.Module):
     # ------------------------------------------------------------------------------------------- regularisers
 
     @timed("regularisers")
-    def _regularisers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
+    def _regularizers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
-        places = self._places(march) if {"eikonal", "surface", "hessian"} & set(names) else None
+        inputs = self._regularizer_inputs(march) if {"eikonal", "surface", "hessian"} & set(names) else None
         if "eikonal" in names:
-            terms["eikonal"] = losses.eikonal(places.gradient)
+            terms["eikonal"] = losses.eikonal(inputs.gradient)
         if "surface" in names:
-            terms["surface"] = losses.surface(places.distance, SURFACE_WIDTH[self.config.loss.points])
+            terms["surface"] = losses.surface(inputs.distance, SURFACE_WIDTH[self.config.loss.points])
         if "hessian" in names:
-            terms["hessian"] = losses.hessian(self.sdf_field.hessian(places.curved))
+            terms["hessian"] = losses.hessian(self.sdf_field.hessian(inputs.curved))
         if "point_cloud" in names and self.point_position is not None:
             rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
             sample = self.sdf_field.with_gradient(self.point_position[rows])
@@ -354,12 +356,12 @@ class VolSdfHost(nn.Module):
         distance = march.surface.distance.view_as(march.distances)
         return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
 
-    def _places(self, march: March) -> Places:
-        """Points of the regularisers of G (`loss.points`)."""
+    def _regularizer_inputs(self, march: March) -> RegularizerInputs:
+        """Inputs of the regularisers of G, at the points that `loss.points` names."""
         position = march.hits.position.detach()
         if self.config.loss.points == "rays":
             near_surface = position + HIT_RADIUS * torch.randn_like(position)
-            return Places(march.surface.gradient, march.surface.distance, near_surface)
+            return RegularizerInputs(march.surface.gradient, march.surface.distance, near_surface)
         about_object = torch.empty_like(position).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
         anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.config.volume.radius
         points = torch.cat((about_object, anywhere))
@@ -368,6 +370,6 @@ class VolSdfHost(nn.Module):
         one_of_ray = torch.arange(rays, device=points.device) * count + torch.randint(
             count, (rays,), device=points.device
         )
-        return Places(
+        return RegularizerInputs(
             torch.cat((sample.gradient, march.surface.gradient[one_of_ray])), sample.distance, points
         )

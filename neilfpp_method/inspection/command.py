@@ -82,7 +82,7 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
             "masks": sum(view.mask is not None for view in capture.views),
             "validity_masks": sum(view.valid is not None for view in capture.views),
             "point_cloud": capture.point_cloud is not None,
-            "scene": {"centre": list(capture.normalisation.center), "radius": capture.normalisation.scale},
+            "scene": {"centre": list(capture.normalization.center), "radius": capture.normalization.scale},
             "scene_from": capture.scene_from,
             "coverage": placement.coverage,
             "degrees_between_views": placement.gap,

@@ -273,7 +273,7 @@ def _of_scene(capture: Capture) -> Iterator[Finding]:
     if capture.point_cloud is None:
         return
     try:
-        points = load_point_cloud(capture.point_cloud, capture.normalisation).position
+        points = load_point_cloud(capture.point_cloud, capture.normalization).position
     except UserError as error:
         yield Finding("point_cloud", "problem", error.problem, error.remedy)
         return

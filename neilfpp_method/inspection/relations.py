@@ -52,7 +52,7 @@ class CameraPlacement:
 
 def camera_placement(capture: Capture) -> CameraPlacement:
     """Compute the placement of the cameras of a capture."""
-    cameras = [capture.normalisation.camera(view.camera) for view in capture.views]
+    cameras = [capture.scene_camera(view) for view in capture.views]
     centers = np.stack([camera.c2w[:, 3] for camera in cameras])
     away = []
     for camera in cameras:

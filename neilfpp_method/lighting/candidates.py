@@ -63,8 +63,8 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
         At most `count` places: the lit lamps in their order, then random places near each of them, then
         random places in the whole scene.
     """
-    current, axis = lamps.position[: lamps.count], lamps.axis[: lamps.count]
-    moved = current.repeat_interleave(CLONES, 0)
+    lit = lamps.lit_places
+    moved = lit.position.repeat_interleave(CLONES, 0)
     moved = moved + STEP * torch.randn_like(moved)
     # About half of the points of a cube lie in its ball, and some of those are too close to the surface.
     anywhere = REACH * (2 * torch.rand(6 * count, 3, device=surface.device, dtype=surface.dtype) - 1)
@@ -73,8 +73,8 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
     guesses = guesses[clear]
     turned = safe_normalize(safe_normalize(-guesses) + AXIS_SPREAD * torch.randn_like(guesses))
     is_bulb = torch.rand_like(guesses[:, :1]) < BULB_SHARE
-    axes = torch.cat((axis, turned.masked_fill(is_bulb, 0.0)))
-    return LampPlaces(torch.cat((current, guesses)), axes)[:count]
+    axes = torch.cat((lit.axis, turned.masked_fill(is_bulb, 0.0)))
+    return LampPlaces(torch.cat((lit.position, guesses)), axes)[:count]
 
 
 @torch.no_grad()

@@ -12,14 +12,14 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 
-__all__ = ["MIN_POINTS", "Evidence", "Light", "compare", "evidence", "fit_light"]
+__all__ = ["MIN_POINTS", "CarriedLight", "Evidence", "MapAndLamps", "compare", "evidence", "fit_light"]
 
 RATE = 0.1
 """Learning rate of log radiance in the first step of a fit."""
@@ -46,7 +46,7 @@ receives.
 
 
 @dataclass(frozen=True)
-class Light:
+class MapAndLamps:
     """The parameters of a map and M lamps.
 
     Attributes:
@@ -101,7 +101,7 @@ def evidence(gain: Float[Tensor, " N"]) -> Evidence:
     return Evidence(gain.mean().item(), (gain.std(correction=0) / len(gain) ** 0.5).item(), len(gain))
 
 
-def fit_light(start: Light, transport: Transport, target: Target, objective: Objective) -> Light:
+def fit_light(start: MapAndLamps, transport: Transport, target: Target, objective: Objective) -> MapAndLamps:
     """Find the light that best explains the pixels of surface points.
 
     The minimised sum (see `objective`) consists of
@@ -143,9 +143,9 @@ def fit_light(start: Light, transport: Transport, target: Target, objective: Obj
     visible_share = (transport.sources[0] > 0).float().mean(0)
     set_by_images = ((visible_share > MIN_VISIBLE_SHARE) | (reaching_any >= texels))[:, None]
 
-    def light() -> Light:
+    def light() -> MapAndLamps:
         colored = log_radiance.expand_as(start.log_radiance)
-        return Light(colored, torch.where(is_reachable, root.square() / reach.clamp_min(1e-20), 0.0))
+        return MapAndLamps(colored, torch.where(is_reachable, root.square() / reach.clamp_min(1e-20), 0.0))
 
     def loss_of(gain: Float[Tensor, "#N 3"]) -> Float[Tensor, ""]:
         strength = light().strength()[reaching_any]
@@ -157,31 +157,49 @@ def fit_light(start: Light, transport: Transport, target: Target, objective: Obj
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
     descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)
     fitted = light()
-    fitted = Light(fitted.log_radiance.detach(), fitted.intensity.detach())
+    fitted = MapAndLamps(fitted.log_radiance.detach(), fitted.intensity.detach())
     finite = fitted.log_radiance.isfinite().all() and fitted.intensity.isfinite().all()
     return fitted if finite else start
 
 
+@dataclass(frozen=True)
+class CarriedLight:
+    """A light, and the transport from its sources to N points."""
+
+    light: MapAndLamps
+    transport: Transport
+
+    def __getitem__(self, rows: Bool[Tensor, " N"]) -> CarriedLight:
+        """The light at some of the points."""
+        return CarriedLight(self.light, self.transport[rows])
+
+    def with_light(self, light: MapAndLamps) -> CarriedLight:
+        """Another light from the same sources."""
+        return CarriedLight(light, self.transport)
+
+    def fit(self, target: Target, objective: Objective) -> MapAndLamps:
+        """Find the light that best explains the points (`fit_light`), from this light on."""
+        return fit_light(self.light, self.transport, target, objective)
+
+
 @torch.no_grad()
 def compare(
-    lights: tuple[Light, Light],
-    transports: tuple[Transport, Transport],
-    target: Target,
-    objective: Objective,
+    first: CarriedLight, second: CarriedLight, target: Target, objective: Objective
 ) -> Float[Tensor, " N"]:
     """Relative error under the first light minus that under the second, at held-back points.
 
     The relative error of a channel is clipped at 1, so that a few outliers do not dominate the mean.
 
     Args:
-        lights: the two lights.
-        transports: the transport to the points, for each of the lights.
-        target: the held-back points and their pixels.
+        first, second: the two lights at the held-back points.
+        target: these points and their pixels.
         objective: defines the relative error.
     """
     gain = math.exp(objective.log_scale)
-    first, second = (
-        objective.relative_error(light.strength(), transport, target, gain).abs().clamp_max(1).mean(-1)
-        for light, transport in zip(lights, transports, strict=True)
-    )
-    return first - second
+
+    def error(carried: CarriedLight) -> Float[Tensor, " N"]:
+        strength = carried.light.strength()
+        relative = objective.relative_error(strength, carried.transport, target, gain)
+        return relative.abs().clamp_max(1).mean(-1)
+
+    return error(first) - error(second)

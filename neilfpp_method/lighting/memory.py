@@ -32,7 +32,7 @@ class SurfaceMemory(nn.Module):
     def __init__(self, capacity: int, every: int) -> None:
         super().__init__()
         self.every = every
-        self.points = Ring(capacity, 12)
+        self.points = Ring(capacity, Observed.WIDTH)
         self.waited = 0
         self.age: int | None = None
 
@@ -52,8 +52,7 @@ class SurfaceMemory(nn.Module):
         """
         self.waited += self.age is None
         share = len(observed) if self.age is None else math.ceil(self.points.capacity / self.every)
-        rows = torch.cat((observed.position, observed.normal, observed.wo, observed.pixel), -1)
-        self.points.keep(rows[:share])
+        self.points.keep(observed.rows()[:share])
         if self.age is not None:
             self.age += 1
 
@@ -64,7 +63,7 @@ class SurfaceMemory(nn.Module):
     def recall(self) -> Observed:
         """All remembered points, for a fit; the count of steps to the next fit restarts."""
         self.age = 0
-        return Observed(*self.points.kept().split(3, -1))
+        return Observed.of_rows(self.points.kept())
 
     def get_extra_state(self) -> dict[str, int | None]:
         """The counters, for a checkpoint."""

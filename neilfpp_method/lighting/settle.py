@@ -19,11 +19,10 @@ from torch import Tensor
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
 from neilfpp_method.lighting.descent import Unknown, descend
+from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.transport import Transport, in_sight, lamp_kernel
-from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import Observed, SceneTracer
 
 __all__ = ["settle_lamps"]
 
@@ -58,10 +57,7 @@ def settle_lamps(
     found: FoundLamps,
     radius: float,
     beside: Transport,
-    observed: Observed,
-    target: Target,
-    lobe: Lobe | None,
-    scene: SceneTracer | None,
+    points: FitPoints,
     objective: Objective,
 ) -> FoundLamps:
     """Refine lamps and drop superfluous ones.
@@ -75,22 +71,20 @@ def settle_lamps(
         found: initial lamps, the strongest first.
         radius: radius of every lamp, in scene units.
         beside: transport of all other light, as constant radiance (it has no sources).
-        observed: the surface points.
-        target: their material and pixels.
-        lobe: as in `from_texels`.
-        scene: as in `from_texels`.
+        points: the surface points.
         objective: the terms of the loss and their weights.
 
     Returns:
         The refined lamps; `found` if there are no points or the descent is not finite.
     """
-    if not len(found.intensity) or not len(observed):
+    if not len(found.intensity) or not len(points.observed):
         return found
+    target, position = points.target, points.observed.position
 
     def loss_of(
         lamps: FoundLamps, sight: Bool[Tensor, "N M"], gain: Float[Tensor, "#N 3"]
     ) -> Float[Tensor, ""]:
-        kernel = lamp_kernel(lamps.places, radius, sight, observed, target.material.roughness, lobe)
+        kernel = points.lamp_kernel(lamps.places, radius, sight)
         contribution = kernel[0].mean(0)[:, None] * lamps.intensity
         all_light = contribution.sum(0) + beside.scene[0].mean(0)
         misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
@@ -98,7 +92,7 @@ def settle_lamps(
 
     def settle(lamps: FoundLamps) -> _Settled:
         # Visibility is not differentiated: it is computed once per descent, at the initial positions.
-        sight = in_sight(lamps.places, radius, observed.position, scene)
+        sight = points.in_sight(lamps.places, radius)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
     best = settle(found)
@@ -111,7 +105,7 @@ def settle_lamps(
         if without.loss < best.loss:
             best = without
     for number in range(len(best.lamps.intensity)):
-        pair = best, settle(_of_other_kind(best.lamps, number, observed.position))
+        pair = best, settle(_of_other_kind(best.lamps, number, position))
         panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
     return settle(best.lamps).lamps

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.fields.environment import EVEN_ROWS
+from neilfpp_method.fields.environment import EVEN_ROWS, EnvironmentLight
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.fit import Evidence, Light, compare, evidence, fit_light
+from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, compare, evidence
+from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
-from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import MapLightConfig
-from neilfpp_method.shading.brdf import Lobe
-from neilfpp_method.structures import Material, Observed, SceneTracer
 
 __all__ = ["solve_light"]
 
@@ -39,10 +39,7 @@ point.
 @torch.no_grad()
 def solve_light(
     light: LightModel,
-    observed: Observed,
-    material: Material,
-    lobe: Lobe | None,
-    scene: SceneTracer | None,
+    points: FitPoints,
     objective: Objective,
     config: MapLightConfig,
     first: bool,
@@ -54,10 +51,7 @@ def solve_light(
 
     Args:
         light: the light to set; its current values are the initial values of the fit.
-        observed: the surface points.
-        material: their material.
-        lobe: as in `from_texels`.
-        scene: as in `from_texels`.
+        points: the surface points.
         objective: the terms of the loss and their weights.
         config: settings of the light. With kind "auto" the light is fitted with and without lamps, and the
             lamps are used if they lower the error at points held back from both fits (`Evidence.favours`).
@@ -69,61 +63,89 @@ def solve_light(
     Returns:
         The comparison of the fits with and without lamps; None if the settings decide.
     """
-    environment, lamps = light.light, light.lamps
-    target = Target(observed.position, material, observed.pixel)
-    no_lamps = environment.log_radiance.new_zeros(0, 3)
-    # `unknown` are the texels to fit, as a view of the map, so that `copy_` sets them.
-    if config.map is None:
-        # An even light is a single source, which is stored in the first texel.
-        even = environment.even
-        unknown = environment.log_radiance[:, :1, :1] if even else environment.log_radiance
-        traced = environment.at_most(EVEN_ROWS) if even else environment
-        from_map = from_texels(traced, observed, material.roughness, lobe, scene)
-        from_map = from_map.sum_sources() if even else from_map
-    else:
-        unknown = environment.log_radiance.new_zeros(3, 0, 0)
-        known = environment.at_most(KNOWN_ROWS)
-        from_map = from_texels(known, observed, material.roughness, lobe, scene)
-        from_map = from_map.with_strength(known.log_radiance.exp().flatten(1).t())
-    map_only = Light(unknown, no_lamps)
+    lamps, target = light.lamps, points.target
+    map_only = _map_only(light.light, points, is_known=config.map is not None)
+    unknown, no_lamps = map_only.light.log_radiance, map_only.light.intensity
     if config.kind == "distant":
-        unknown.copy_(fit_light(map_only, from_map, target, objective).log_radiance)
+        unknown.copy_(map_only.fit(target, objective).log_radiance)
         return None
 
-    places = propose(lamps, observed.position, CANDIDATES)
-    from_candidates = from_lamps(places, lamps.radius, observed, material.roughness, lobe, scene)
-    from_both = from_map.concatenate(from_candidates)
+    places = propose(lamps, points.observed.position, CANDIDATES)
+    from_candidates = points.from_lamps(places, lamps.radius)
     intensity = no_lamps.new_zeros(len(places.position), 3)
-    intensity[: lamps.count] = lamps.intensity[: lamps.count]
-    start = Light(unknown, intensity)
-    if config.kind != "auto":
-        found, measured = fit_light(start, from_both, target, objective), None
-    else:
-        # Surfaces learn under the light that is chosen first and then confirm it, so the first decision uses
-        # all folds.
-        fold = _folds(observed.position)
-        gains = []
-        for number in range(FOLDS if first else 1):
-            held_back, fitted = fold == number, fold != number
-            plain = fit_light(map_only, from_map[fitted], target[fitted], objective)
-            found = fit_light(start, from_both[fitted], target[fitted], objective)
-            transports = (from_map[held_back], from_both[held_back])
-            gains.append(compare((plain, found), transports, target[held_back], objective))
-        measured = evidence(torch.cat(gains))
+    intensity[: lamps.count] = lamps.lit_intensity
+    start = CarriedLight(MapAndLamps(unknown, intensity), map_only.transport.concatenate(from_candidates))
+    measured = None
+    if config.kind == "auto":
+        compared = _compare_at_held_back_points(map_only, start, target, objective, FOLDS if first else 1)
+        found, measured = compared.with_lamps, compared.evidence
         if not measured.favours(chosen=lamps_if_undecided or lamps.count > 0):
-            unknown.copy_(plain.log_radiance)
+            unknown.copy_(compared.without_lamps.log_radiance)
             lamps.place(no_lamps, no_lamps)
             return measured
+    else:
+        found = start.fit(target, objective)
     unknown.copy_(found.log_radiance)
     merged = merge(places, found.intensity, from_candidates.sources[0].mean(0), len(lamps.position))
-    map_light = from_map.with_strength(unknown.exp().flatten(1).t())
-    merged = settle_lamps(merged, lamps.radius, map_light, observed, target, lobe, scene, objective)
+    map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
+    merged = settle_lamps(merged, lamps.radius, map_light, points, objective)
     # The map was fitted together with the candidates, so it must be fitted again with the refined lamps.
-    from_merged = from_lamps(merged.places, lamps.radius, observed, material.roughness, lobe, scene)
-    found = fit_light(Light(unknown, merged.intensity), from_map.concatenate(from_merged), target, objective)
+    from_merged = points.from_lamps(merged.places, lamps.radius)
+    refined = CarriedLight(
+        MapAndLamps(unknown, merged.intensity), map_only.transport.concatenate(from_merged)
+    )
+    found = refined.fit(target, objective)
     unknown.copy_(found.log_radiance)
     lamps.place(merged.places.position, found.intensity, merged.places.axis)
     return measured
+
+
+def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> CarriedLight:
+    """The map without lamps. Its `log_radiance` is a view of the texels to fit, so that `copy_` sets them."""
+    no_lamps = environment.log_radiance.new_zeros(0, 3)
+    if is_known:
+        known = environment.at_most(KNOWN_ROWS)
+        from_known = points.from_texels(known).with_strength(known.log_radiance.exp().flatten(1).t())
+        return CarriedLight(MapAndLamps(environment.log_radiance.new_zeros(3, 0, 0), no_lamps), from_known)
+    if environment.even:
+        # An even light is a single source, which is stored in the first texel.
+        from_even = points.from_texels(environment.at_most(EVEN_ROWS)).sum_sources()
+        return CarriedLight(MapAndLamps(environment.log_radiance[:, :1, :1], no_lamps), from_even)
+    return CarriedLight(MapAndLamps(environment.log_radiance, no_lamps), points.from_texels(environment))
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """Two fits to all points but the last fold held back, and the evidence of all folds held back.
+
+    Attributes:
+        without_lamps: the last fit without lamps.
+        with_lamps: the last fit with lamps.
+        evidence: the comparison of the two at held-back points.
+    """
+
+    without_lamps: MapAndLamps
+    with_lamps: MapAndLamps
+    evidence: Evidence
+
+
+def _compare_at_held_back_points(
+    map_only: CarriedLight, with_lamps: CarriedLight, target: Target, objective: Objective, folds: int
+) -> _Compared:
+    """Fit the light with and without lamps, with so many of the `FOLDS` folds held back in turn.
+
+    Surfaces learn under the light that is chosen first and then confirm it, so the first decision uses all
+    folds.
+    """
+    fold = _folds(target.position)
+    gains = []
+    for number in range(folds):
+        held_back, fitted = fold == number, fold != number
+        plain = map_only[fitted].fit(target[fitted], objective)
+        found = with_lamps[fitted].fit(target[fitted], objective)
+        lights = (map_only[held_back].with_light(plain), with_lamps[held_back].with_light(found))
+        gains.append(compare(*lights, target[held_back], objective))
+    return _Compared(plain, found, evidence(torch.cat(gains)))
 
 
 def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:

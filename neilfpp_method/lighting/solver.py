@@ -22,6 +22,7 @@ from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.memory import SurfaceMemory
 from neilfpp_method.lighting.objective import DARK_FLOOR, Objective
 from neilfpp_method.lighting.sky import SkySightings
@@ -236,27 +237,17 @@ class MapSolver(nn.Module):
     ) -> Evidence | None:
         environment = light.light
         sky = None if self.sky is None or environment.even else self.sky.known()
-        # If cameras saw the light directly, their pixels fix the scale.
-        log_scale = self._log_scale(material) if sky is None else 0.0
         objective = Objective(
             self.response,
             self.unit,
             self.config.fit.steps,
             sky=sky,
             monochrome=self.config.monochrome,
-            log_scale=log_scale,
+            # If cameras saw the light directly, their pixels fix the scale.
+            log_scale=self._log_scale(material) if sky is None else 0.0,
         )
-        measured = solve_light(
-            light,
-            observed,
-            material,
-            self.lobe,
-            scene,
-            objective,
-            self.config,
-            first,
-            lamps_if_undecided=at_start,
-        )
+        points = FitPoints(observed, material, self.lobe, scene)
+        measured = solve_light(light, points, objective, self.config, first, lamps_if_undecided=at_start)
         if environment.even:
             environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())
         return measured

@@ -142,7 +142,7 @@ class CaptureRayGenerator(RayGenerator):
     def __init__(self, dataset: CaptureDataset, device: torch.device | str) -> None:
         super().__init__(dataset.cameras.to(device))
         capture, views = dataset.pixels.capture, dataset.pixels.views
-        self._rays = CameraRays([capture.normalisation.camera(view.camera) for view in views], device)
+        self._rays = CameraRays([capture.scene_camera(view) for view in views], device)
 
     def forward(self, ray_indices: Int[Tensor, "N 3"]) -> RayBundle:
         """Rays through pixels: view, row, column."""

@@ -21,7 +21,7 @@ from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, lens_from_nerfstudio, nerfstudio_coefficients
 from neilfpp_method.data.formats.transforms import FLIP
 from neilfpp_method.data.images import image_header
-from neilfpp_method.data.views import Camera, Normalisation, View, check_camera
+from neilfpp_method.data.views import Camera, Normalization, View, check_camera
 from neilfpp_method.errors import UserError
 
 __all__ = ["CaptureParser", "CaptureParserConfig", "capture_of", "neilfpp_data"]
@@ -57,7 +57,7 @@ class CaptureParser(DataParser):
         capture = load_capture(chosen.data, chosen.format, chosen.test_every, response=chosen.response)
         # Nerfstudio needs at least one evaluation view; if none is held out it gets a training view.
         views = capture.train_views if split == "train" else capture.test_views or capture.train_views[:1]
-        frame = capture.normalisation
+        frame = capture.normalization
         transform = torch.eye(4)[:3]
         transform[:, 3] = -torch.tensor(frame.center)
         return DataparserOutputs(
@@ -124,7 +124,7 @@ def capture_of(outputs: DataparserOutputs) -> Capture:
         raise UserError(f"{views[0].image.parent}: HDR and LDR images together", "use images of one kind")
     folder = views[0].image.parent
     return Capture(
-        folder, "nerfstudio", folder, views, Normalisation(1.0, (0.0, 0.0, 0.0)), kinds.pop(), frozenset()
+        folder, "nerfstudio", folder, views, Normalization(1.0, (0.0, 0.0, 0.0)), kinds.pop(), frozenset()
     )
 
 

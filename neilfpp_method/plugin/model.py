@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any, Optional
@@ -27,7 +26,6 @@ from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import improve_material, light_places, review_light
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
-from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
@@ -40,10 +38,11 @@ from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, tone_map
-from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.shading.sampling import combine, cosine
 from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
@@ -107,24 +106,7 @@ class NeilfMethod(Model):
         if self.config.host is None:
             self.neilf = build_model(pixels.capture, facts, settings)
         else:
-            arguments = {"scene_box": self.scene_box, "num_train_data": self.num_train_data, **self.kwargs}
-            foreign = build_foreign(self.config.host, arguments)
-            self.rates = dataclasses.replace(settings.optimizer, geometry=foreign.rate)
-            host = NerfstudioHost(
-                foreign.model,
-                response=facts.response,
-                radiance_scale=facts.radiance_scale,
-                own_losses=self.config.host_losses > 0.0,
-            )
-            self.proxy = proxy_for(host, settings)
-            whole = ForeignHost(host, borrowed=False, proxy=self.proxy)
-            self.neilf = NeilfModel(whole, settings, facts)
-            self.neilf.observers.append(lambda batch, hits: whole.show_proxy(batch.rays, hits))
-            if self.proxy is not None:
-                CONSOLE.log(
-                    f"{self.config.host} cannot trace rays cheaply: shadows and inter-reflection are traced "
-                    "on a proxy of its surface that is built from the training rays"
-                )
+            self._build_on(self.config.host, facts)
         self.pixels = pixels
         self.light_solver = self.neilf.light_solver()
         seed_step(settings.train.seed, step=-2)
@@ -136,6 +118,28 @@ class NeilfMethod(Model):
         self.step = -1
         self.set_up_for: Stage | None = None
         self.while_training = ExitStack()
+
+    def _build_on(self, name: str, facts: SceneFacts) -> None:
+        """Build the model on top of a nerfstudio method, with a proxy if that cannot trace rays cheaply."""
+        settings = self.config.neilf
+        arguments = {"scene_box": self.scene_box, "num_train_data": self.num_train_data, **self.kwargs}
+        foreign = build_foreign(name, arguments)
+        self.rates = dataclasses.replace(settings.optimizer, geometry=foreign.rate)
+        host = NerfstudioHost(
+            foreign.model,
+            response=facts.response,
+            radiance_scale=facts.radiance_scale,
+            own_losses=self.config.host_losses > 0.0,
+        )
+        self.proxy = proxy_for(host, settings)
+        whole = ForeignHost(host, borrowed=False, proxy=self.proxy)
+        self.neilf = NeilfModel(whole, settings, facts)
+        self.neilf.observers.append(lambda batch, hits: whole.show_proxy(batch.rays, hits))
+        if self.proxy is not None:
+            CONSOLE.log(
+                f"{name} cannot trace rays cheaply: shadows and inter-reflection are traced on a proxy of "
+                "its surface that is built from the training rays"
+            )
 
     @property
     def stage(self) -> Stage:
@@ -212,7 +216,7 @@ class NeilfMethod(Model):
         settings = self.config.neilf
         seed_step(settings.train.seed, -4 - step)
         plan, pixels = Plan.begin(EffectRequest("as-set"), settings), self.pixels.on(self.device)
-        _, first = review_light(plan, self.neilf, pixels, step)
+        first = review_light(plan, self.neilf, pixels, step).first
         if first is not None:
             CONSOLE.log(first.summary())
             start_with(self.neilf, first)
@@ -250,7 +254,7 @@ class NeilfMethod(Model):
         if ends:
             self.watch.pixels = self.watch.pixels.to(self.device)
             self.watch.after_stage(self.neilf, self.neilf.stages[position.stage], self.guard.skipped, done)
-            CONSOLE.log(f"health after {position.stage.value}: {Health.of(self.watch.findings.values())}")
+            CONSOLE.log(f"health after {position.stage.value}: {self.watch.health}")
             if self.proxy is not None and self.proxy.report() is not None:
                 CONSOLE.log(str(self.proxy.report()))
         # The condition under which nerfstudio saves.
@@ -335,13 +339,11 @@ class NeilfMethod(Model):
         rows = torch.nonzero(maps.roughness[:, 0])[:, 0]
         if not len(rows):
             return light
-        normal, wo = maps.normal[rows], -rays.directions[rows]
+        normal = maps.normal[rows]
         position = rays.origins[rows] + maps.depth[rows] * rays.directions[rows]
         count = self.config.neilf.shading.train_samples
         # The pdf of the cosine sampler cancels the cosine, so the estimate is a plain mean.
-        drawn = sample_directions(
-            "cosine", normal, wo, maps.roughness[rows], count, self.neilf.lobe, stochastic=False
-        )
+        drawn = combine([(cosine(normal), count)], stochastic=False)
         light[rows] = self.neilf.incident_light(position, drawn.wi).mean(dim=1)
         return light
 
@@ -349,7 +351,8 @@ class NeilfMethod(Model):
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR and SSIM of display values on the object, as in `neilfpp eval`, and pictures of all maps."""
-        truth, rgb, volume = (self._display(image.to(self.device)) for image in _images(batch, outputs))
+        drawn = (batch["image"], outputs["rgb"], outputs["rgb_volume"])
+        truth, rgb, volume = (self._display(image.to(self.device)) for image in drawn)
         # Without a mask, the rendered opacity selects the pixels of the object.
         on_object = (
             batch["object_mask"].cpu() > 0.5
@@ -378,7 +381,3 @@ class NeilfMethod(Model):
 
     def _display(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         return tone_map(image) if self.neilf.facts.response == "linear" else image.clamp(0.0, 1.0)
-
-
-def _images(batch: Mapping[str, Any], outputs: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    return batch["image"], outputs["rgb"], outputs["rgb_volume"]

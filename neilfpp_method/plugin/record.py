@@ -17,15 +17,10 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.train.checkpoint import last_checkpoint, save_checkpoint
 from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.optimizer import make_optimizer
-from neilfpp_method.train.run import (
-    BESIDE_NERFSTUDIO,
-    CaptureSource,
-    create_run,
-    last_checkpoint,
-    save_checkpoint,
-)
+from neilfpp_method.train.run import BESIDE_NERFSTUDIO, CaptureSource, create_run
 
 __all__ = ["RunRecord", "no_record"]
 

@@ -38,7 +38,7 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
     """
     views = [gray_view(view, capture.hdr) for view in capture.views]
     cameras = [view.camera for view in views]
-    center = np.array(capture.normalisation.center)
+    center = np.array(capture.normalization.center)
     sources = choose_sources(cameras, center, STEREO_SOURCES)
     if not any(sources):
         raise UserError(f"{capture.root}: no two views see the scene from nearby", "use --cloud sparse")
@@ -47,7 +47,7 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
     for view, reference, others in zip(capture.views, views, sources, strict=True):
         path = folder / f"{view.name}.exr"
         if not path.is_file():
-            write_exr(path, {"Z": sweep(reference, [views[j] for j in others], capture.normalisation)})
+            write_exr(path, {"Z": sweep(reference, [views[j] for j in others], capture.normalization)})
         depths.append(read_image(path).pixels[..., 0])
         bar.advance()
     steps = [

@@ -99,11 +99,11 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
         views = write_views(
             posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance
         )
-        if posed.normalisation:
-            box = SceneBox(posed.normalisation, posed.scene_from)
+        if posed.normalization:
+            box = SceneBox(posed.normalization, posed.scene_from)
         else:
             box = find_box(views, points)
-        files = CaptureFiles(step.folder, views, box.normalisation, scene_from=box.source)
+        files = CaptureFiles(step.folder, views, box.normalization, scene_from=box.source)
         write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
         step.complete({})
     prepared = load_capture(step.folder)
@@ -171,7 +171,7 @@ def _publish(
     points = write_oriented_ply(out / CLOUD, cloud) if len(cloud.position) else None
     views = tuple(_relocate(view, prepared.root, out) for view in prepared.views)
     test = _test_views(source.posed, views, options.test_every)
-    box = prepared.normalisation
+    box = prepared.normalization
     summary = Summary(
         placements=source.placed,
         models=source.models,

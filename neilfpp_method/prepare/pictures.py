@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.point_cloud import WorldPoints
-from neilfpp_method.data.views import Camera, Normalisation, View
+from neilfpp_method.data.views import Camera, Normalization, View
 from neilfpp_method.prepare.summary import Placement
 
 __all__ = ["draw_fit", "draw_scene", "write_picture"]
@@ -52,7 +52,7 @@ def write_picture(
     views: Sequence[View],
     test: Collection[str],
     points: WorldPoints,
-    box: Normalisation,
+    box: Normalization,
     placed: Sequence[Placement],
 ) -> None:
     """Write the picture as PNG; without the chart of errors if the poses came with the images."""
@@ -63,7 +63,7 @@ def write_picture(
 
 
 def draw_scene(
-    views: Sequence[View], test: Collection[str], points: WorldPoints, box: Normalisation
+    views: Sequence[View], test: Collection[str], points: WorldPoints, box: Normalization
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw cameras as pyramids, points coloured by their normals, and the scene's sphere, from above and the
     side.

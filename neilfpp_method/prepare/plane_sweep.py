@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.undistort import resample, straight_camera
-from neilfpp_method.data.views import Camera, Normalisation, View
+from neilfpp_method.data.views import Camera, Normalization, View
 from neilfpp_method.shading.color import luminance
 
 __all__ = ["GrayView", "choose_sources", "gray_view", "inverse_depth_step", "sweep"]
@@ -151,7 +151,7 @@ def inverse_depth_step(camera: Camera, sources: Sequence[Camera]) -> float:
     return 1.0 / (camera.fx * baseline)
 
 
-def sweep(reference: GrayView, sources: Sequence[GrayView], box: Normalisation) -> Float32[np.ndarray, "H W"]:
+def sweep(reference: GrayView, sources: Sequence[GrayView], box: Normalization) -> Float32[np.ndarray, "H W"]:
     """Compute the depth map of a view by plane-sweep stereo.
 
     The planes are evenly spaced in inverse depth, cover the scene's sphere, and are at most one pixel of
@@ -198,7 +198,7 @@ class _Windows:
 
 
 def _planes(
-    reference: GrayView, sources: Sequence[GrayView], box: Normalisation
+    reference: GrayView, sources: Sequence[GrayView], box: Normalization
 ) -> Float64[np.ndarray, " D"]:
     """The inverse depths of the planes, from the farthest to the nearest."""
     camera = reference.camera

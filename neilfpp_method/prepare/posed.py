@@ -14,7 +14,7 @@ from neilfpp_method.data.formats.colmap import camera_of
 from neilfpp_method.data.formats.copies import copy_view
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.raw import RAW_SUFFIXES
-from neilfpp_method.data.views import Normalisation, SceneSource, View
+from neilfpp_method.data.views import Normalization, SceneSource, View
 from neilfpp_method.prepare.matching_copies import relative_exposures
 from neilfpp_method.prepare.photos import Photos, read_photo
 
@@ -28,15 +28,15 @@ class Posed:
     Attributes:
         views: the views, in the world frame.
         linear: whether pixels are linear radiance.
-        normalisation: the scene's sphere, if the capture states it.
+        normalization: the scene's sphere, if the capture states it.
         cloud: oriented point cloud of the capture, if it has one.
         test: names of the test views, if the capture states them.
-        scene_from: where `normalisation` comes from.
+        scene_from: where `normalization` comes from.
     """
 
     views: tuple[View, ...]
     linear: bool
-    normalisation: Normalisation | None = None
+    normalization: Normalization | None = None
     cloud: Path | None = None
     test: frozenset[str] | None = None
     scene_from: SceneSource = "box"
@@ -59,7 +59,7 @@ def posed_by_model(photos: Photos, model: pycolmap.Reconstruction) -> Posed:
 
 def posed_by_capture(capture: Capture) -> Posed:
     """Return the views of a capture, with its scene box unless that was guessed from the cameras."""
-    known = capture.normalisation if capture.scene_from != "cameras" else None
+    known = capture.normalization if capture.scene_from != "cameras" else None
     return Posed(capture.views, capture.hdr, known, capture.point_cloud, capture.test, capture.scene_from)
 
 

@@ -75,7 +75,7 @@ def view_shots(capture: Capture, views: Sequence[View], scale: float | None, wid
         raise UserError(f"{capture.root}: no such views", "choose --views train or turntable")
     shots = []
     for view in views:
-        camera = capture.normalisation.camera(view.camera)
+        camera = capture.scene_camera(view)
         shot_camera = resized(camera, _factor(camera, scale, width))
         same_size = (shot_camera.width, shot_camera.height) == (camera.width, camera.height)
         shots.append(Shot(view.name, shot_camera, view if same_size else None))
@@ -99,7 +99,7 @@ def turntable(capture: Capture, frames: int, scale: float | None, width: int | N
     """
     if not 2 <= frames <= MAX_FRAMES:
         raise UserError(f"a turntable cannot have {frames} frames", f"give 2 to {MAX_FRAMES} with --frames")
-    cameras = [capture.normalisation.camera(view.camera) for view in capture.views]
+    cameras = [capture.scene_camera(view) for view in capture.views]
     eyes = np.stack([camera.c2w[:, 3] for camera in cameras])
     distances = np.linalg.norm(eyes, axis=-1).clip(1e-6)
     distance = float(np.median(distances))

@@ -44,7 +44,7 @@ from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_folder
 from neilfpp_method.train.run import Run, load_run
 
-__all__ = ["Request", "relight"]
+__all__ = ["RelightRequest", "relight"]
 
 OWN = "own"
 """Name of the run's estimated light in paths and records."""
@@ -59,7 +59,7 @@ FORMAT = 1
 
 
 @dataclass(frozen=True)
-class Request:
+class RelightRequest:
     """Options of the command; `commands.relight.Relight` documents the fields."""
 
     run: Path
@@ -90,7 +90,7 @@ class Request:
 
 
 def relight(
-    request: Request,
+    request: RelightRequest,
     say: Callable[[str], None] = lambda text: None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
@@ -115,7 +115,7 @@ def relight(
     shots = _shots(request, run)
     lights = _lights(request, run, say)
     lamps = _lamps(request, run)
-    box = None if request.box is None else scene_box(request.box, run.capture.normalisation)
+    box = None if request.box is None else scene_box(request.box, run.capture.normalization)
     stencils = read_stencils(request.mask, run.capture)
     folders = {name: PictureFolder(out / name, _settings(request, run, name)) for name in lights}
     truths = [find_truth(folder, [shot.view for shot in shots]) for folder in request.truth]
@@ -139,7 +139,7 @@ def relight(
 # ---------------------------------------------------------------------------------------------------- options
 
 
-def _check(request: Request) -> None:
+def _check(request: RelightRequest) -> None:
     """Check everything that does not need the run."""
     positive = {
         "--spp": request.spp,
@@ -191,7 +191,7 @@ def _check(request: Request) -> None:
     map_names(request.env)
 
 
-def _shots(request: Request, run: Run) -> list[Shot]:
+def _shots(request: RelightRequest, run: Run) -> list[Shot]:
     capture = run.capture
     if TURNTABLE in request.views:
         return turntable(capture, request.frames, request.scale, request.width)
@@ -199,7 +199,7 @@ def _shots(request: Request, run: Run) -> list[Shot]:
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 
 
-def _lights(request: Request, run: Run, say: Callable[[str], None]) -> dict[str, Sky]:
+def _lights(request: RelightRequest, run: Run, say: Callable[[str], None]) -> dict[str, Sky]:
     """The environment maps by name, on the device of the run; the run's own light if no map is given."""
     device = next(run.model.parameters()).device
     if not request.env:
@@ -221,7 +221,7 @@ def _lights(request: Request, run: Run, say: Callable[[str], None]) -> dict[str,
     return lights
 
 
-def _settings(request: Request, run: Run, name: str) -> dict[str, Any]:
+def _settings(request: RelightRequest, run: Run, name: str) -> dict[str, Any]:
     """All settings that affect an image, as values for JSON."""
     path = dict(zip(map_names(request.env), request.env, strict=True)).get(name)
     settings = {
@@ -242,29 +242,29 @@ def _settings(request: Request, run: Run, name: str) -> dict[str, Any]:
     return settings | {key: getattr(request, key) for key in copied}
 
 
-def _budget(request: Request) -> Budget:
+def _budget(request: RelightRequest) -> Budget:
     """The limits per image, with the default number of samples if the options set no limit."""
     return Budget(request.spp or (SAMPLES if request.seconds is None else None), request.seconds)
 
 
-def _with_lamps(request: Request) -> bool:
+def _with_lamps(request: RelightRequest) -> bool:
     """Whether the run's lamps are lit: if requested, and by default under the run's own light."""
     requested = request.lamps == "keep" or bool(request.lamp_edits)
     return requested or (request.lamps == "auto" and not request.env)
 
 
-def _lamps(request: Request, run: Run) -> Lamplight | None:
+def _lamps(request: RelightRequest, run: Run) -> Lamplight | None:
     if not _with_lamps(request):
         return None
     edits = parse_lamp_edits(request.lamp_edits)
-    return edited_lamps(lamps_of_run(run.model.lamps), edits, run.capture.normalisation)
+    return edited_lamps(lamps_of_run(run.model.lamps), edits, run.capture.normalization)
 
 
 # -------------------------------------------------------------------------------------------------- rendering
 
 
 def _render(
-    request: Request,
+    request: RelightRequest,
     scenes: Mapping[str, Scene],
     folders: Mapping[str, PictureFolder],
     missing: Mapping[str, Sequence[Shot]],

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
 
@@ -53,7 +53,7 @@ def parse_edits(texts: Sequence[str]) -> list[Edit]:
     return [_parse(text) for text in texts]
 
 
-def scene_box(corners: Sequence[float], normalisation: Normalisation) -> Box:
+def scene_box(corners: Sequence[float], normalization: Normalization) -> Box:
     """Build a box from two opposite corners x y z x y z in the world frame.
 
     Raises:
@@ -65,7 +65,7 @@ def scene_box(corners: Sequence[float], normalisation: Normalisation) -> Box:
         raise UserError(
             "--box has no inside", "give two opposite corners, x y z x y z, in the world frame of the capture"
         )
-    return Box(normalisation.to_scene(low).float(), normalisation.to_scene(high).float())
+    return Box(normalization.to_scene(low).float(), normalization.to_scene(high).float())
 
 
 def with_edits(materials: Materials, edits: Sequence[Edit], limits: Sequence[Limit] = ()) -> Materials:

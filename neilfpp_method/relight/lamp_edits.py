@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.lamplight import Lamplight
 
@@ -44,14 +44,14 @@ def parse_lamp_edits(texts: Sequence[str]) -> list[LampEdit]:
 
 
 def edited_lamps(
-    lamps: Lamplight | None, edits: Sequence[LampEdit], normalisation: Normalisation
+    lamps: Lamplight | None, edits: Sequence[LampEdit], normalization: Normalization
 ) -> Lamplight | None:
     """Move or remove lamps. The axis of a panel does not change.
 
     Args:
         lamps: the lamps of the run, or None.
         edits: the changes.
-        normalisation: transformation from the world frame to the scene frame.
+        normalization: transformation from the world frame to the scene frame.
 
     Returns:
         The remaining lamps, or None if there are none.
@@ -76,7 +76,7 @@ def edited_lamps(
             remaining[edit.number] = False
         else:
             world_position = torch.tensor(edit.position, dtype=torch.float64)
-            position[edit.number] = normalisation.to_scene(world_position).to(position)
+            position[edit.number] = normalization.to_scene(world_position).to(position)
     if not remaining.any():
         return None
     return Lamplight(position[remaining], lamps.axis[remaining], lamps.radiance[remaining], lamps.radius)

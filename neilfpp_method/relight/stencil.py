@@ -86,7 +86,7 @@ def _read(path: Path, capture: Capture) -> Stencil:
             f"{camera.width}×{camera.height}",
             "paint it over the whole view, in any size with the same aspect ratio",
         )
-    camera = resized(capture.normalisation.camera(camera), factor)
+    camera = resized(capture.normalization.camera(camera), factor)
     file = read_image(path)
     value = torch.from_numpy(file.pixels).mean(-1)
     if file.alpha is not None:

@@ -9,8 +9,8 @@ from typing import Any
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.json_files import read_json
-from neilfpp_method.train.run import last_checkpoint
 
 __all__ = ["OWN", "Measured", "is_outdated", "numbers", "read_measured"]
 

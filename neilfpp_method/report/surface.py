@@ -46,7 +46,7 @@ def packed_surface(run: Run) -> dict[str, Any]:
         UserError: the run has no surface, or no camera sees it.
     """
     full = fine_surface(run, RESOLUTION)
-    cameras = [run.capture.normalisation.camera(view.camera) for view in run.capture.train_views]
+    cameras = [run.capture.scene_camera(view) for view in run.capture.train_views]
     surface = clean(full, visible_faces(full, cameras))
     if len(surface.faces) > FACES:
         points, faces = fast_simplification.simplify(

@@ -20,8 +20,9 @@ from neilfpp_method.report.page import page
 from neilfpp_method.report.surface import packed_surface
 from neilfpp_method.report.views import ReportViews, encode_views, run_for_display
 from neilfpp_method.schedule import Stage
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.light_record import light_summary, read_fits
-from neilfpp_method.train.run import Run, last_checkpoint, load_run
+from neilfpp_method.train.run import Run, load_run
 
 __all__ = ["REPORT", "ReportOptions", "write_report"]
 

@@ -11,7 +11,7 @@ from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN, BrdfValu
 from neilfpp_method.shading.color import apply_response, linear_to_srgb, luminance, srgb_to_linear, tone_map
 from neilfpp_method.shading.frame import local_frame, safe_normalize
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.shading.sampling import Sampling, sample_directions
 
 __all__ = [
     "GGX",
@@ -19,6 +19,7 @@ __all__ = [
     "SPHERICAL_GAUSSIAN",
     "BrdfValue",
     "Lobe",
+    "Sampling",
     "apply_response",
     "directional_albedo",
     "evaluate",

@@ -27,6 +27,7 @@ from neilfpp_method.shading.frame import at_least_float32, dot, local_frame
 from neilfpp_method.structures import IncidentSamples
 
 __all__ = [
+    "Sampling",
     "Technique",
     "combine",
     "cosine",
@@ -47,6 +48,9 @@ LOBE_SHARE = 0.25
 """Share of the directions of "mis" for the lobe if the light can be sampled, which has the rest
 (docs/performance.md).
 """
+
+WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
+"""Samplers that replace those of the lobe on Lambertian surfaces, which have none."""
 
 
 @dataclass(frozen=True)
@@ -181,25 +185,46 @@ def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
     return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
 
 
+@dataclass(frozen=True)
+class Sampling:
+    """How incident directions are sampled.
+
+    Attributes:
+        kind: the sampler. "fibonacci", "cosine" and "lobe" are one technique; "mis" is half cosine and half
+            lobe, or the light and the lobe if the light can be sampled; "no_lobe" is the light or the cosine.
+        count: directions per point.
+        lobe: the specular lobe; None for Lambertian surfaces, for which "mis" is "no_lobe" and "lobe" is
+            "cosine".
+        stochastic: whether the directions are random; if False, every call returns the same ones.
+    """
+
+    kind: str
+    count: int
+    lobe: Lobe | None
+    stochastic: bool
+
+
 def sample_directions(
-    kind: str,
+    sampling: Sampling,
     n: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N 3"],
     roughness: Float[Tensor, "N 1"],
-    count: int,
-    lobe: Lobe | None,
-    stochastic: bool,
     light: Technique | None = None,
 ) -> IncidentSamples:
-    """Sample `count` incident directions per point, in at least float32.
+    """Sample incident directions at N points, in at least float32.
 
-    The kinds are "fibonacci", "cosine", "lobe", "mis" and "no_lobe". "mis" is half cosine and half lobe; with
-    a `light`, whose technique contains the cosine, it is light and lobe. "no_lobe" is the light; the cosine
-    if `light` is None.
+    Args:
+        sampling: the sampler and the number of directions.
+        n, wo: unit normals, and unit directions to the viewer.
+        roughness: roughness of the surface.
+        light: samples the light times the cosine; None if the light cannot be sampled.
 
     Raises:
         UserError: there is no such sampler.
     """
+    kind, count, lobe = sampling.kind, sampling.count, sampling.lobe
+    if lobe is None:
+        kind = WITHOUT_LOBE.get(kind, kind)
     if kind == "fibonacci":
         techniques = [(fibonacci(n), count)]
     elif kind == "cosine":
@@ -213,4 +238,4 @@ def sample_directions(
         techniques = [(light or cosine(n), count)]
     else:
         raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or no_lobe")
-    return combine(techniques, stochastic)
+    return combine(techniques, sampling.stochastic)

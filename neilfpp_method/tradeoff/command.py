@@ -10,24 +10,16 @@ from rich.console import Console
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, Point, frontier
-from neilfpp_method.tradeoff.rows import check_same, measured, rows_of, run_row
+from neilfpp_method.tradeoff.rows import TradeoffRequest, check_same, measured, rows_of, run_row
 from neilfpp_method.train.output import check_folder
 
 __all__ = ["run_tradeoff"]
 
 
 def run_tradeoff(
-    data: Path,
-    out: Path,
-    config: NeilfConfig,
-    budgets: Sequence[float],
-    seeds: int,
-    device: str,
-    console: Console,
-    at_end: Callable[[Path], None] | None = None,
+    request: TradeoffRequest, console: Console, at_end: Callable[[Path], None] | None = None
 ) -> list[Point]:
     """Train and evaluate all runs that are not finished, one after the other, and write the frontier.
 
@@ -35,12 +27,7 @@ def run_tradeoff(
     skipped, and tried again by the next call.
 
     Args:
-        data: folder of the capture.
-        out: folder for the runs and the frontier.
-        config: the settings of all runs; the seeds start at that of the settings.
-        budgets: the time budgets, in seconds.
-        seeds: number of runs per budget.
-        device: name of the device.
+        request: the runs.
         console: where progress is printed.
         at_end: called with the folder of each run that has been trained.
 
@@ -48,13 +35,13 @@ def run_tradeoff(
         The points of the frontier.
 
     Raises:
-        UserError: if the input is unusable, if `out` contains runs of another capture or with other
+        UserError: if the input is unusable, if the folder contains runs of another capture or with other
             settings, or if no run could be finished.
         Stopped: if the user stops the command; the next call continues it.
     """
-    rows = rows_of(data, out, config, budgets, seeds, device)
+    out, rows = request.out, rows_of(request)
     # Errors in the capture are raised before anything is written.
-    load_capture(data)
+    load_capture(request.data)
     check_folder(out)
     for row in rows:
         check_same(row)
@@ -70,7 +57,7 @@ def run_tradeoff(
             console.print(f"skipped: {refused}", style="yellow", soft_wrap=True)
             continue
         runs = [result for result in map(measured, rows) if result is not None]
-        write_tradeoff(out, f"{data.resolve().name}, {config.preset}", runs)
+        write_tradeoff(out, f"{request.data.resolve().name}, {request.config.preset}", runs)
     runs = [result for result in map(measured, rows) if result is not None]
     if not runs:
         raise UserError(f"{out}: no run could be made", refused)

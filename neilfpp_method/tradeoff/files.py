@@ -12,8 +12,8 @@ from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.images import replacing
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.frontier import FIGURES, Measured, frontier
-from neilfpp_method.train.environment import environment
 from neilfpp_method.train.json_files import write_json
+from neilfpp_method.train.provenance import provenance
 
 __all__ = ["write_tradeoff"]
 
@@ -36,7 +36,7 @@ def write_tradeoff(out: Path, title: str, runs: Sequence[Measured]) -> None:
     stored = {
         "format": FORMAT,
         "title": title,
-        "machine": {name: value for name, value in environment().items() if name != "command"},
+        "machine": {name: value for name, value in provenance().items() if name != "command"},
         "runs": [dataclasses.asdict(run) for run in runs],
         "points": [dataclasses.asdict(point) for point in points],
     }

@@ -29,10 +29,31 @@ from neilfpp_method.train.quality import read_checks
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
-__all__ = ["Row", "check_same", "measured", "rows_of", "run_row"]
+__all__ = ["Row", "TradeoffRequest", "check_same", "measured", "rows_of", "run_row"]
 
 METRICS = "metrics.json"
 """File of a run with its metrics on test views."""
+
+
+@dataclass(frozen=True)
+class TradeoffRequest:
+    """The runs of a tradeoff.
+
+    Attributes:
+        data: folder of the capture.
+        out: folder for the runs and the frontier.
+        config: the settings of all runs; the seeds start at that of the settings.
+        budgets: the time budgets, in seconds.
+        seeds: number of runs per budget.
+        device: name of the device.
+    """
+
+    data: Path
+    out: Path
+    config: NeilfConfig
+    budgets: Sequence[float]
+    seeds: int
+    device: str
 
 
 @dataclass(frozen=True)
@@ -61,26 +82,24 @@ class Row:
         return self.out.name
 
 
-def rows_of(
-    data: Path, out: Path, config: NeilfConfig, budgets: Sequence[float], seeds: int, device: str
-) -> list[Row]:
+def rows_of(request: TradeoffRequest) -> list[Row]:
     """A row for each budget and seed, in order of budget, with folders `OUT/10m-seed0` and so on.
 
     Raises:
         UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
     """
+    budgets, config = request.budgets, request.config
     if not budgets or len(set(map(format_duration, budgets))) != len(budgets):
         raise UserError("--budgets is empty or contains a budget twice", "give each once, as 1m,3m,10m")
-    if seeds < 1:
-        raise UserError(f"--seeds is {seeds}", "set it to 1 or more")
+    if request.seeds < 1:
+        raise UserError(f"--seeds is {request.seeds}", "set it to 1 or more")
     effects = "as-set" if config.preset.startswith("paper-") else "auto"
     rows = []
     for budget in sorted(budgets):
-        for seed in range(config.train.seed, config.train.seed + seeds):
+        for seed in range(config.train.seed, config.train.seed + request.seeds):
+            out = request.out / f"{format_duration(budget)}-seed{seed}"
             seeded = replace(config, train=replace(config.train, seed=seed))
-            rows.append(
-                Row(data, out / f"{format_duration(budget)}-seed{seed}", seeded, effects, budget, device)
-            )
+            rows.append(Row(request.data, out, seeded, effects, budget, request.device))
     return rows
 
 

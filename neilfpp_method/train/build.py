@@ -27,7 +27,14 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.optimizer import seed_step
 
-__all__ = ["build_model", "cloud_summary", "exposures_of", "initial_model", "scene_facts", "show_known_light"]
+__all__ = [
+    "build_model",
+    "cloud_summary",
+    "exposures_at_cloud",
+    "initial_model",
+    "scene_facts",
+    "show_known_light",
+]
 
 LDR_SCALE = 1.0
 """Largest radiance that R can represent for LDR input, as published: the scale of its sigmoid."""
@@ -74,17 +81,17 @@ def scene_facts(
     if color is None and kind != "none":
         color = tuple(pixels.border_median().tolist())
     return SceneFacts(
-        response,
-        median,
-        scale,
-        kind,
-        color or (0.0, 0.0, 0.0),
+        response=response,
+        median_radiance=median,
+        radiance_scale=scale,
+        background=kind,
+        background_color=color or (0.0, 0.0, 0.0),
         far_points=capture.scene_from == "focus",
         log_gains=() if log_gains is None else tuple(log_gains.flatten().tolist()),
     )
 
 
-def exposures_of(capture: Capture, pixels: PixelDataset) -> Exposures | None:
+def exposures_at_cloud(capture: Capture, pixels: PixelDataset) -> Exposures | None:
     """Measure the relative exposures of the training photographs at the points of the capture's point cloud.
 
     Returns:
@@ -92,7 +99,7 @@ def exposures_of(capture: Capture, pixels: PixelDataset) -> Exposures | None:
     """
     if capture.point_cloud is None:
         return None
-    return measure_exposures(pixels, load_point_cloud(capture.point_cloud, capture.normalisation))
+    return measure_exposures(pixels, load_point_cloud(capture.point_cloud, capture.normalization))
 
 
 def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:
@@ -130,14 +137,14 @@ def show_known_light(model: NeilfModel) -> None:
 
 
 def _volsdf(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> VolSdfHost:
-    poses = [capture.normalisation.camera(view.camera).c2w for view in capture.train_views]
+    poses = [capture.scene_camera(view).c2w for view in capture.train_views]
     cameras = torch.from_numpy(np.stack(poses)[:, :, 3]).float()
     return VolSdfHost(config, facts, _cloud_points(capture, config), cameras)
 
 
 def _mesh(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> MeshHost:
     path = config.host.path
-    mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalisation)
+    mesh = Truth(capture).mesh() if path is None else read_mesh(Path(path), capture.normalization)
     if mesh is None:
         raise UserError(
             f"{capture.root}: no inputs/model/mesh.ply for the mesh host", "name a mesh with --mesh PATH"
@@ -165,7 +172,7 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
-    cameras = [capture.normalisation.camera(view.camera) for view in capture.train_views]
+    cameras = [capture.scene_camera(view) for view in capture.train_views]
     met = [host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]) for camera in cameras]
     outside = torch.cat([crossings.outside for crossings in met])
     if not len(outside):
@@ -186,7 +193,7 @@ def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
 def _cloud_points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
     if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
-    points = load_point_cloud(capture.point_cloud, capture.normalisation)
+    points = load_point_cloud(capture.point_cloud, capture.normalization)
     # G is defined within the scene sphere only.
     within = points[points.position.norm(dim=-1) < config.volume.radius]
     if not len(within):

@@ -20,7 +20,6 @@ from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import table
 from neilfpp_method.errors import Unsound
-from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.inspection.findings import problems_of_poses
@@ -31,10 +30,16 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger, recording
 from neilfpp_method.train.budget_record import write_budget
 from neilfpp_method.train.budgeted import close_budget, outcome
-from neilfpp_method.train.build import build_model, cloud_summary, exposures_of, initial_model, scene_facts
-from neilfpp_method.train.device import pick_device
+from neilfpp_method.train.build import (
+    build_model,
+    cloud_summary,
+    exposures_at_cloud,
+    initial_model,
+    scene_facts,
+)
+from neilfpp_method.train.checkpoint import last_checkpoint
+from neilfpp_method.train.device import pick_device, waiting
 from neilfpp_method.train.effects_record import write_plan
-from neilfpp_method.train.health_record import health_summary
 from neilfpp_method.train.launch import launch
 from neilfpp_method.train.light_record import light_summary
 from neilfpp_method.train.lock import run_lock
@@ -49,11 +54,11 @@ from neilfpp_method.train.progress import Reporter, reporting
 from neilfpp_method.train.quality import Quality, has_checks
 from neilfpp_method.train.reading import load_pixels
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import PIXELS, create_run, last_checkpoint
+from neilfpp_method.train.run import PIXELS, create_run
 from neilfpp_method.train.start import start_geometry
 from neilfpp_method.train.stopping import continue_command, stop_request
 from neilfpp_method.train.training import Training
-from neilfpp_method.train.work_record import waiting, write_work
+from neilfpp_method.train.work_record import write_work
 
 __all__ = ["run_training"]
 
@@ -101,9 +106,9 @@ def run_training(
             training = _train(request, run, prepared, ledger, console)
     if fabric.is_global_zero:
         _finish(run, training, console, at_end)
-    findings = list(training.watch.findings.values())
-    if request.strict and verdict_of(findings) == "failed":
-        raise Unsound(f"{run.out}: {findings[0].what}", findings[0].remedy)
+    health = training.watch.health
+    if request.strict and health.verdict == "failed":
+        raise Unsound(f"{run.out}: {health.findings[0].what}", health.findings[0].remedy)
     return run.out
 
 
@@ -163,7 +168,7 @@ def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | N
     """
     if not plan.is_on("exposure"):
         return None
-    exposures = exposures_of(capture, pixels)
+    exposures = exposures_at_cloud(capture, pixels)
     record_exposures(plan, exposures)
     if not plan.is_on("exposure"):
         return None
@@ -290,8 +295,7 @@ def _finish(
         console.print(f"light: {light_summary(training.config.light, training.fits)}", soft_wrap=True)
     if training.plan.request.base != "as-set":
         console.print(table(training.plan))
-    findings = list(training.watch.findings.values())
-    console.print(f"health: {health_summary(findings)}", soft_wrap=True, markup=False)
+    console.print(f"health: {training.watch.health}", soft_wrap=True, markup=False)
     if at_end is not None:
         at_end(run.out)
     if run.budget is not None:

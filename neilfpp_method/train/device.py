@@ -1,14 +1,15 @@
-"""Choose the device to compute on."""
+"""The device to compute on."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import torch
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["pick_device"]
+__all__ = ["pick_device", "waiting"]
 
 
 def pick_device(name: str) -> torch.device:
@@ -26,3 +27,8 @@ def pick_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise UserError(f"no device '{name}' here", "use cpu, cuda, cuda:N or auto") from error
     return torch.device(name)
+
+
+def waiting(device: torch.device) -> Callable[[], object] | None:
+    """A function that waits until a device has finished its work; None if calls are synchronous."""
+    return (lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None

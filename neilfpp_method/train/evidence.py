@@ -31,13 +31,13 @@ from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import seed_step
 from neilfpp_method.train.training import Training
 
-__all__ = ["apply_plan", "review_before_stage", "search_material", "solve_light"]
+__all__ = ["apply_plan", "observe_and_solve", "review_before_stage", "search_material"]
 
 Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
 """Measures with the model after so many steps and adds its decisions to the plan."""
 
 
-def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: int) -> None:
+def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
     """Pass a step to the light solver, which fits the light when that is due.
 
     The first process does this for all.
@@ -51,35 +51,38 @@ def solve_light(run: Training, model: NeilfModel, computed: StepResult, step: in
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
         with timed("light_fits", apart=True):
-            evidence = solver.solve(model.brdf, model.scene)
-        note_fit(run.fits, evidence, model.lamps.count, step)
-        _report(run, record_lamps(run.plan, evidence, model.lamps.count, step + 1))
-    _share_light(run, model)
+            evidence = solver.solve(run.model.brdf, run.model.scene)
+        lamps = run.model.lamps.count
+        note_fit(run.fits, evidence, lamps, step)
+        _report(run, record_lamps(run.plan, evidence, lamps, step + 1))
+    _share_light(run)
 
 
-def _share_light(run: Training, model: NeilfModel) -> None:
+def _share_light(run: Training) -> None:
     """Copy the light of the first process to all others."""
     if run.fabric.world_size > 1:
-        for part in (model.light, model.lamps):
+        for part in (run.model.light, run.model.lamps):
             part.load_state_dict(run.fabric.broadcast(part.state_dict()))
 
 
-def review_before_stage(run: Training, model: NeilfModel, step: int) -> None:
+def review_before_stage(run: Training, step: int) -> None:
     """Take the measurements before a stage that trains material."""
-    if model.stages[stage_at(step, run.config.train).stage].moves_material:
-        _review_effects(run, model, step, review_surface, -3)
-        _start_light(run, model, step)
-        _review_effects(run, model, step, review_material, -5)
+    if run.model.stages[stage_at(step, run.config.train).stage].moves_material:
+        _review_effects(run, step, review_surface, -3)
+        _start_light(run, step)
+        _review_effects(run, step, review_material, -5)
 
 
-def _start_light(run: Training, model: NeilfModel, step: int) -> None:
+def _start_light(run: Training, step: int) -> None:
     """Set the initial light before a material is trained. The first process does this for all."""
     if not run.light_solver.seeks_start:
         return
+    model = run.model
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, -4 - step)
-        decisions, first = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        review = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        decisions, first = review.decisions, review.first
         _report(run, decisions)
         if first is not None:
             run.reporter.say(first.summary())
@@ -87,16 +90,16 @@ def _start_light(run: Training, model: NeilfModel, step: int) -> None:
             evidence = run.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
             note_fit(run.fits, evidence, model.lamps.count, step)
             _report(run, record_lamps(run.plan, evidence, model.lamps.count, step))
-    _share_light(run, model)
-    _share_decisions(run, model, decisions)
+    _share_light(run)
+    _share_decisions(run, decisions)
 
 
-def search_material(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+def search_material(run: Training, position: StagePosition, step: int) -> None:
     """When it is due, search for paint taken for metal, and train the BRDF field on it.
 
     The first process does this for all.
     """
-    most = _light_pixels(run)
+    model, most = run.model, _light_pixels(run)
     if most < MIN_PIXELS or not is_search_due(model, position):
         return
     if run.fabric.is_global_zero:
@@ -115,12 +118,11 @@ def _light_pixels(run: Training) -> int:
     return MAX_PIXELS if most is None else most
 
 
-def _review_effects(run: Training, model: NeilfModel, step: int, review: Review, stream: int) -> None:
+def _review_effects(run: Training, step: int, review: Review, stream: int) -> None:
     """Decide open effects by evidence. The first process does this for all.
 
     Args:
         run: the training.
-        model: its model.
         step: number of steps trained so far.
         review: takes the measurements.
         stream: selects the random numbers of these measurements, so that no training step uses the same.
@@ -130,28 +132,28 @@ def _review_effects(run: Training, model: NeilfModel, step: int, review: Review,
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_step(run.config.train.seed, stream - step)
-        decisions = review(run.plan, model, run.pixels, step)
+        decisions = review(run.plan, run.model, run.pixels, step)
         _report(run, decisions)
-    _share_decisions(run, model, decisions)
+    _share_decisions(run, decisions)
 
 
-def _share_decisions(run: Training, model: NeilfModel, decisions: Sequence[Decision]) -> None:
+def _share_decisions(run: Training, decisions: Sequence[Decision]) -> None:
     """Apply the decisions of the first process in all processes."""
     decisions = run.fabric.broadcast(decisions)
     if not run.fabric.is_global_zero:
         run.plan.decisions += decisions
-    apply_plan(run, model)
+    apply_plan(run)
 
 
-def apply_plan(run: Training, model: NeilfModel) -> None:
+def apply_plan(run: Training) -> None:
     """Apply the plan of effects to the model and the light solver; it may remove the joint stage."""
     config = run.plan.config
     if not config.train.joint_steps:
         run.config = dataclasses.replace(
             run.config, train=dataclasses.replace(run.config.train, joint_steps=0)
         )
-    model.use(config)
-    run.light_solver.use(config.light, model.lobe)
+    run.model.use(config)
+    run.light_solver.use(config.light, run.model.lobe)
 
 
 def _report(run: Training, decisions: Sequence[Decision]) -> None:

@@ -116,22 +116,39 @@ def _origin(order: int, func: Any, value: Tensor) -> Origin:
     wrong = ~torch.isfinite(flat)
     rows = tuple(torch.nonzero(wrong.any(1))[:, 0].tolist())
     node = torch._C._current_autograd_node()
-    place, code = _place_of_forward(node) if node is not None else _place_here()
-    derivative = None if node is None else node.name()
-    return Origin(order, str(func), derivative, place, code, int(wrong.sum()), flat.numel(), rows, len(flat))
+    line = _line_of_forward(node) if node is not None else _line_here()
+    return Origin(
+        order=order,
+        operation=str(func),
+        derivative_of=None if node is None else node.name(),
+        place=line.place,
+        code=line.code,
+        broken=int(wrong.sum()),
+        values=flat.numel(),
+        rows=rows,
+        length=len(flat),
+    )
 
 
-def _place_here() -> tuple[str | None, str]:
-    """Place and source line of the innermost frame of this package on the call stack."""
+@dataclass(frozen=True)
+class _Line:
+    """A line of this package: file, number and function, and its source; None and empty if there is none."""
+
+    place: str | None = None
+    code: str = ""
+
+
+def _line_here() -> _Line:
+    """The line of the innermost frame of this package on the call stack."""
     for frame in reversed(traceback.extract_stack()):
         path = Path(frame.filename)
         if path.is_relative_to(PACKAGE) and path != Path(__file__):
-            return f"{path.relative_to(PACKAGE)}:{frame.lineno} ({frame.name})", frame.line or ""
-    return None, ""
+            return _Line(f"{path.relative_to(PACKAGE)}:{frame.lineno} ({frame.name})", frame.line or "")
+    return _Line()
 
 
-def _place_of_forward(node: Any) -> tuple[str | None, str]:
-    """Place and source line of the forward operation of an autograd node.
+def _line_of_forward(node: Any) -> _Line:
+    """The line of the forward operation of an autograd node.
 
     Torch's anomaly mode stores the traceback, as lines of the form `File "…", line 3, in f`.
     """
@@ -140,5 +157,5 @@ def _place_of_forward(node: Any) -> tuple[str | None, str]:
         name, _, rest = head.removeprefix('File "').partition('", line ')
         number, _, function = rest.partition(", in ")
         if Path(name).is_relative_to(PACKAGE) and Path(name) != Path(__file__):
-            return f"{Path(name).relative_to(PACKAGE)}:{number} ({function})", code.strip()
-    return None, ""
+            return _Line(f"{Path(name).relative_to(PACKAGE)}:{number} ({function})", code.strip())
+    return _Line()

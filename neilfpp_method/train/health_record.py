@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neilfpp_method.health.cases import Finding, Health
+from neilfpp_method.health.cases import Finding
 from neilfpp_method.health.watch import FILE, FORMAT, Watch
 from neilfpp_method.train.json_files import read_entries, write_json
 
-__all__ = ["health_summary", "read_findings", "write_findings"]
+__all__ = ["read_findings", "write_findings"]
 
 
 def write_findings(run: Path, watch: Watch) -> None:
@@ -26,8 +26,3 @@ def read_findings(run: Path) -> list[Finding] | None:
         UserError: if the file is damaged or of another version.
     """
     return read_entries(run / FILE, FORMAT, "findings", Finding)
-
-
-def health_summary(findings: list[Finding]) -> str:
-    """The verdict in one line."""
-    return str(Health.of(findings))

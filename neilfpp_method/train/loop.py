@@ -10,14 +10,14 @@ import dataclasses
 import math
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.hosts.base import HasSurfaceWidth
 from neilfpp_method.schedule import (
     StagePosition,
     Total,
@@ -30,9 +30,18 @@ from neilfpp_method.schedule import (
 from neilfpp_method.settings.facts import RadianceUnits
 from neilfpp_method.structures import LossTerms
 from neilfpp_method.timing.ledger import timed
+from neilfpp_method.train.checkpoint import (
+    LAST,
+    checkpoint_path,
+    last_checkpoint,
+    load_checkpoint,
+    load_weights,
+    save_checkpoint,
+)
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.evidence import apply_plan, review_before_stage, search_material, solve_light
+from neilfpp_method.train.evidence import apply_plan, observe_and_solve, review_before_stage, search_material
 from neilfpp_method.train.health_record import read_findings, write_findings
+from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.light_record import read_fits, write_fits
 from neilfpp_method.train.optimizer import (
     gradient_norms,
@@ -43,7 +52,6 @@ from neilfpp_method.train.optimizer import (
     waiting_fields,
 )
 from neilfpp_method.train.quality import read_checks, write_checks
-from neilfpp_method.train.run import load_checkpoint, load_weights, read_json, save_checkpoint, write_json
 from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.training import Training
 from neilfpp_method.train.work_record import write_work
@@ -68,29 +76,26 @@ def train(run: Training) -> None:
     step = _restore(run, optimizer)
     optimizer = run.fabric.setup_optimizers(optimizer)
     if step == 0:
-        review_before_stage(run, model, 0)
+        review_before_stage(run, step)
     while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
-        step = _train_stage(run, model, optimizer, step, position)
+        step = _train_stage(run, optimizer, position, step)
         if run.fabric.is_global_zero:
             with timed("checks", apart=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
             with timed("checks", apart=True):
-                review_before_stage(run, model, step)
-        _save(run, optimizer, step, also=position.stage.value)
+                review_before_stage(run, step)
+        _save(run, optimizer, step, names=(position.stage.value, LAST))
         with timed("checks", apart=True):
             model.eval()
             run.preview(model, position.stage)
             model.train()
 
 
-def _train_stage(
-    run: Training, model: NeilfModel, optimizer: torch.optim.Optimizer, step: int, position: StagePosition
-) -> int:
+def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: StagePosition, step: int) -> int:
     """Train the remaining steps of a stage. Returns the number of steps trained so far in all stages."""
-    settings = run.config.train
-    stage = position.stage
+    model, stage, settings = run.model, position.stage, run.config.train
     model.freeze_for(stage)
     # A data-parallel wrapper is made for each stage, because it fixes the set of trained parameters.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
@@ -105,20 +110,21 @@ def _train_stage(
         with run.ledger.step(number):
             seed_step(settings.seed, step, run.fabric.global_rank)
             at = StagePosition(stage, number, length)
-            waiting = waiting_fields(run.model, run.config.optimizer, at)
+            waiting = waiting_fields(model, run.config.optimizer, at)
             set_rates(optimizer, run.config.optimizer, at, waiting)
             with timed("data"):
                 batch = run.pixels.sample(settings.rays, gradients)
-            moment = Moment.before_step(model, batch, at)
+            moment = Moment.before_step(model, batch, at, step)
             computed = wrapped(batch, stage)
             total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
-            stop = _update(run, model, optimizer, computed.terms, total, moment, step)
-            solve_light(run, model, computed, step)
+            stop = _update(run, optimizer, computed.terms, total, moment)
+            observe_and_solve(run, computed, step)
         run.watch.after_step(model.stages[stage], computed, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
-        search_material(run, model, StagePosition(stage, number, length), step)
-        _check_quality(run, model, StagePosition(stage, number, length), step)
+        reached = StagePosition(stage, number, length)
+        search_material(run, reached, step)
+        _check_quality(run, reached, step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number == length:
             # `train` saves the end of a stage under its name, and a stop takes effect after that.
@@ -142,20 +148,14 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
 
 
 @timed("checks", apart=True)
-def _check_quality(run: Training, model: NeilfModel, position: StagePosition, step: int) -> None:
+def _check_quality(run: Training, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
-        run.quality.check_when_due(model, position, step, run.ledger.total)
+        run.quality.check_when_due(run.model, position, step, run.ledger.total)
 
 
 @timed("optimiser")
 def _update(
-    run: Training,
-    model: NeilfModel,
-    optimizer: torch.optim.Optimizer,
-    terms: LossTerms,
-    total: Total,
-    moment: Moment,
-    step: int,
+    run: Training, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, moment: Moment
 ) -> bool:
     """Take an optimizer step. A step whose loss or gradient is not finite is skipped and reported.
 
@@ -165,7 +165,7 @@ def _update(
     if total.loss.requires_grad:
         with timed("gradients"):
             run.fabric.backward(total.loss)
-    norms = gradient_norms(model)
+    norms = gradient_norms(run.model)
     psnr = _psnr(terms, run.model.units)
     stop = torch.full_like(psnr, run.should_stop())
     # The only transfer from the device in a step. All processes use the mean over the processes, so that they
@@ -174,19 +174,19 @@ def _update(
     loss, decibels, stopping, *mean_norms = means
     if all(math.isfinite(value) for value in (loss, *mean_norms)):
         optimizer.step()
-        limit_surface_width(model.host, run.config.volume, moment.position)
+        limit_surface_width(run.model.host, run.config.volume, moment.position)
         run.skipped_in_a_row = 0
     else:
-        named_norms = dict(zip(norms, mean_norms, strict=True))
-        _skip(run, total, named_norms, _keep_skipped(run, model, moment, step), step)
+        _skip(run, total, dict(zip(norms, mean_norms, strict=True)), moment)
     run.reporter.step(loss, decibels)
-    if step % LOG_EVERY == 0:
-        _log(run, model, total, decibels, loss, step)
+    if moment.step % LOG_EVERY == 0:
+        _log(run, total, decibels, loss, moment.step)
     return stopping > 0.0
 
 
-def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, step: int) -> None:
-    """Count and report a skipped step; raise `Diverged` after too many in a row."""
+def _skip(run: Training, total: Total, norms: Mapping[str, float], moment: Moment) -> None:
+    """Count, store and report a skipped step; raise `Diverged` after too many in a row."""
+    kept = _keep_skipped(run, moment)
     run.skipped += 1
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
@@ -196,24 +196,26 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], kept: str, st
         if culprits
         else f"the gradient of {', '.join(fields) or 'another process'}"
     )
-    run.reporter.warn(f"step {step} skipped: {where} is not finite ({run.skipped} skipped so far){kept}")
+    run.reporter.warn(
+        f"step {moment.step} skipped: {where} is not finite ({run.skipped} skipped so far){kept}"
+    )
     if run.skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
         raise Diverged(
             f"{MAX_SKIPPED_IN_A_ROW} steps in a row were not finite, the last one in {where}",
-            f"the last good checkpoint is kept in {run.path / 'checkpoints'}; look at the capture's "
+            f"the last good checkpoint is kept in {last_checkpoint(run.path).parent}; look at the capture's "
             "brightest pixels or lower the learning rates",
         )
 
 
-def _keep_skipped(run: Training, model: NeilfModel, moment: Moment, step: int) -> str:
+def _keep_skipped(run: Training, moment: Moment) -> str:
     """Store a skipped step and return the end of its message. A full disk does not stop the training."""
     if not run.fabric.is_global_zero:
         return ""
     try:
-        kept = keep_step(run.path, model, moment, step)
+        kept = keep_step(run.path, run.model, moment)
     except UserError as error:
         return f"; the step is not stored: {error.problem}"
-    return f"; see neilfpp replay {shlex.quote(str(run.path))} {step}" if kept else ""
+    return f"; see neilfpp replay {shlex.quote(str(run.path))} {moment.step}" if kept else ""
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
@@ -232,7 +234,8 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 
 
 @timed("saving", apart=True)
-def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str | None = None) -> None:
+def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, names: Sequence[str] = (LAST,)) -> None:
+    """Write the records of the run, and its state as checkpoints of these names."""
     if run.fabric.is_global_zero:
         try:
             # The records are written before the checkpoint: when the run is resumed, entries after the
@@ -243,10 +246,8 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
             write_checks(run.path, run.quality)
             if run.pace is not None:
                 run.pace.save(run.path, run.config.train)
-            for name in filter(None, (also, "last")):
-                save_checkpoint(
-                    run.path / "checkpoints" / f"{name}.pt", run.model, run.light_solver, optimizer, step
-                )
+            for name in names:
+                save_checkpoint(checkpoint_path(run.path, name), run.model, run.light_solver, optimizer, step)
             write_json(run.path / "timing.json", run.seconds)
             write_work(run.path, run.ledger)
         except UserError as error:
@@ -255,7 +256,7 @@ def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, also: str 
 
 
 def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
-    path = run.path / "checkpoints" / "last.pt"
+    path = last_checkpoint(run.path)
     if not path.exists():
         return 0
     saved = load_checkpoint(path)
@@ -267,17 +268,16 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     run.fits += read_fits(run.path, saved["step"])
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
     run.quality.checks += read_checks(run.path, saved["step"])
-    apply_plan(run, run.model)
+    apply_plan(run)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 
 
-def _log(run: Training, model: NeilfModel, total: Total, decibels: float, loss: float, step: int) -> None:
+def _log(run: Training, total: Total, decibels: float, loss: float, step: int) -> None:
     values = {"loss/total": loss, "psnr": decibels, "steps_skipped": float(run.skipped)}
     values |= {f"loss/{name}": value.item() for name, value in total.terms.items()}
-    width = getattr(model.host, "surface_width", None)
-    if width is not None:
-        values["beta"] = width().item()
+    if isinstance(run.model.host, HasSurfaceWidth):
+        values["beta"] = run.model.host.surface_width().item()
     if run.fits:
         values |= {
             f"light/{name}": float(getattr(run.fits[-1], name)) for name in ("gain", "deviation", "lamps")

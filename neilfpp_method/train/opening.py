@@ -32,17 +32,11 @@ from neilfpp_method.train.budgeted import (
     planned_effects,
     planned_settings,
 )
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.output import default_folder
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import (
-    CaptureSource,
-    Description,
-    check_free,
-    last_checkpoint,
-    load_checkpoint,
-    read_description,
-)
+from neilfpp_method.train.run import CaptureSource, Description, check_free, read_description
 from neilfpp_method.train.trial import Workload
 from neilfpp_method.train.work_record import read_work
 

@@ -42,7 +42,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     view = _small_view(capture)
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr)]
-    rays = camera_rays(capture.normalisation.camera(view.camera))
+    rays = camera_rays(capture.scene_camera(view))
     panels += [p.reshape(shape) for p in _panels(model, rays, model.stages[stage].moves_material)]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -86,14 +86,12 @@ class Quality:
         if not len(self.pixels) or not self._due(position, step, seconds):
             return
         began = time.perf_counter()
-        radiance, physical = _decibels(
-            model, self.pixels, model.stages[position.stage].moves_material, self.hdr
-        )
+        psnr = _measure(model, self.pixels, model.stages[position.stage].moves_material, self.hdr)
         took = time.perf_counter() - began
         # A model that is not finite is reported by `health`.
-        if not all(map(math.isfinite, (radiance, physical or 0.0))):
-            return
-        self.checks.append(QualityCheck(step, position.stage.value, seconds, radiance, physical, took))
+        if math.isfinite(psnr.radiance) and math.isfinite(psnr.physical or 0.0):
+            stage = position.stage.value
+            self.checks.append(QualityCheck(step, stage, seconds, psnr.radiance, psnr.physical, took))
 
     def _due(self, position: StagePosition, step: int, seconds: float) -> bool:
         if position.step == position.length:
@@ -104,18 +102,23 @@ class Quality:
         return cheap and since >= max(MIN_STEPS, math.ceil(position.length / CHECKS_PER_STAGE))
 
 
+@dataclass(frozen=True)
+class _Measured:
+    """PSNR of R, and of the PBR rendering if there is a material, in dB."""
+
+    radiance: float
+    physical: float | None
+
+
 @torch.no_grad()
-def _decibels(
-    model: NeilfModel, pixels: PixelBatch, with_material: bool, hdr: bool
-) -> tuple[float, float | None]:
-    """PSNR of R, and of the PBR rendering if there is a material."""
+def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool, hdr: bool) -> _Measured:
     mode = model.training
     model.eval()
     maps = model.maps(pixels.rays, with_material)
     model.train(mode)
     photograph = tone_map(pixels.color) if hdr else pixels.color
     physical = _psnr(tone_map(maps.rgb), photograph) if with_material else None
-    return _psnr(tone_map(maps.rgb_volume), photograph), physical
+    return _Measured(_psnr(tone_map(maps.rgb_volume), photograph), physical)
 
 
 def _psnr(rendered: Float[Tensor, "N 3"], photograph: Float[Tensor, "N 3"]) -> float:

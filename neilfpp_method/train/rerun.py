@@ -14,9 +14,10 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import active_losses, weigh
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.build import build_model
+from neilfpp_method.train.checkpoint import load_weights
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.first_not_finite import Origin, OriginsOfNotFinite, is_finite
-from neilfpp_method.train.run import load_weights, read_description
+from neilfpp_method.train.run import read_description
 from neilfpp_method.train.skipped import SkippedStep, load_step
 
 __all__ = ["Rerun", "rerun_step", "rerun_summary"]

@@ -22,16 +22,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from torch import nn
 
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.images import replacing
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
@@ -40,11 +37,12 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.train.build import build_model
+from neilfpp_method.train.checkpoint import FORMAT, LAST, checkpoint_path, load_checkpoint, load_weights
 from neilfpp_method.train.effects_record import read_plan
-from neilfpp_method.train.environment import environment
 from neilfpp_method.train.json_files import read_json, write_json
 from neilfpp_method.train.lock import LOCK
 from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.provenance import provenance
 
 __all__ = [
     "BESIDE_NERFSTUDIO",
@@ -54,18 +52,12 @@ __all__ = [
     "Run",
     "check_free",
     "create_run",
-    "last_checkpoint",
-    "load_checkpoint",
     "load_run",
-    "load_weights",
     "read_description",
     "rewrite_training",
     "run_folder",
-    "save_checkpoint",
 ]
 
-FORMAT = 3
-"""Version of the layout of a run folder and of its checkpoints."""
 BESIDE_NERFSTUDIO = "neilfpp"
 """Name of the run folder that the plugin writes next to nerfstudio's `config.yml`."""
 PIXELS = "pixels"
@@ -74,8 +66,6 @@ DESCRIBING = ("capture.json", "scene.json", "environment.json")
 """Files that are written before `config.json`; a folder is a run once it contains `config.json`."""
 HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
 """Temporary names of these files while `replacing` writes them."""
-CHECKPOINT_KEYS = {"format", "step", "model", "light_solver", "optimizer"}
-"""Keys of a checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +113,7 @@ class Run:
     Attributes:
         path: the run folder.
         config: all settings of the training, with the decisions on effects applied.
-        capture: the capture, with cameras in the world frame. `capture.normalisation` converts to the scene
+        capture: the capture, with cameras in the world frame. `capture.normalization` converts to the scene
             frame, in which all fields of the model are defined.
         facts: facts that were measured in the images before training, such as the unit of radiance and the
             kind of background.
@@ -133,7 +123,7 @@ class Run:
 
     Example:
         >>> run = load_run("runs/teapot")                                              # doctest: +SKIP
-        >>> material = run.model.materials(run.capture.normalisation.to_scene(x_world))  # doctest: +SKIP
+        >>> material = run.model.materials(run.capture.normalization.to_scene(x_world))  # doctest: +SKIP
         >>> material.base_color.shape                                                    # doctest: +SKIP
         torch.Size([N, 3])
     """
@@ -194,7 +184,7 @@ def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: Sc
     description = {
         "capture.json": dataclasses.asdict(source),
         "scene.json": dataclasses.asdict(facts),
-        "environment.json": environment(),
+        "environment.json": provenance(),
         # The settings are written last, because a folder that contains them is a run.
         "config.json": {"format": FORMAT, "config": to_dict(config)},
     }
@@ -214,7 +204,7 @@ def rewrite_training(path: Path, config: TrainConfig) -> None:
     write_json(path / "config.json", stored)
 
 
-def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = "last") -> Run:
+def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = LAST) -> Run:
     """Load a run from its folder.
 
     Args:
@@ -227,7 +217,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     """
     path = Path(path)
     described = read_description(path)
-    saved = load_checkpoint(path / "checkpoints" / f"{checkpoint}.pt")
+    saved = load_checkpoint(checkpoint_path(path, checkpoint))
     capture = described.source.load_again(path)
     plan = read_plan(path, described.config, saved["step"])
     model = build_model(capture, described.facts, plan.config_of_model)
@@ -286,64 +276,4 @@ def _parse(kind: type[Part], values: Any, where: str) -> Part:
         # A key is missing, or a value is not an object.
         raise UserError(
             f"{where}: not a complete description ({error})", "restore the file or train again"
-        ) from error
-
-
-# ------------------------------------------------------------------------------------------------ checkpoints
-
-
-def last_checkpoint(run: Path) -> Path:
-    """The file of the newest checkpoint of a run, from which it continues."""
-    return run / "checkpoints" / "last.pt"
-
-
-def save_checkpoint(
-    path: Path, model: nn.Module, light_solver: nn.Module, optimizer: torch.optim.Optimizer, step: int
-) -> None:
-    """Write the state of model, light solver and optimizer after `step` steps, atomically."""
-    parts = {"model": model, "light_solver": light_solver, "optimizer": optimizer}
-    contents = {"format": FORMAT, "step": step, **{name: part.state_dict() for name, part in parts.items()}}
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        try:
-            torch.save(contents, file)
-        except RuntimeError as error:
-            # If the disk is full, torch raises an error that hides the original one.
-            if isinstance(error.__context__, OSError):
-                raise error.__context__ from None
-            raise
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Read a checkpoint. A file that contains anything but tensors and plain values is rejected.
-
-    Raises:
-        UserError: if the file is missing, unreadable, or of another version.
-    """
-    if not path.is_file():
-        raise UserError(f"{path}: no checkpoint", "train the run first, or continue it with --resume")
-    try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        # A damaged or forged file can raise any exception in the unpickler.
-        remedy = "copy a stage's checkpoint over it, or train again"
-        raise UserError(f"{path}: not a readable checkpoint", remedy) from error
-    if not isinstance(contents, dict) or contents.get("format") != FORMAT or CHECKPOINT_KEYS - set(contents):
-        raise UserError(
-            f"{path}: a checkpoint of another version", "use the version of neilfpp that wrote it"
-        )
-    return contents
-
-
-def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> None:
-    """Load weights of a checkpoint into a model or a light solver.
-
-    Raises:
-        UserError: if they do not fit, because the settings of the run have been changed.
-    """
-    try:
-        module.load_state_dict(weights)
-    except (RuntimeError, TypeError) as error:
-        raise UserError(
-            f"{run}: the checkpoint does not fit the settings in config.json",
-            "restore that file, or use the version of neilfpp that wrote the run",
         ) from error

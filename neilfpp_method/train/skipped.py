@@ -36,17 +36,19 @@ class Moment:
     Attributes:
         batch: the pixels of the step.
         position: the stage and the position within it.
+        step: number of the step, counted over all stages.
         random: state of torch's random number generator on the CPU.
         replay: state of the replay buffer (`lighting.replay`), which the step changes.
     """
 
     batch: PixelBatch
     position: StagePosition
+    step: int
     random: Tensor
     replay: dict[str, Any]
 
     @staticmethod
-    def before_step(model: NeilfModel, batch: PixelBatch, position: StagePosition) -> Moment:
+    def before_step(model: NeilfModel, batch: PixelBatch, position: StagePosition, step: int) -> Moment:
         """Record the state after the pixels of a step are drawn.
 
         The replay buffer, some hundred kilobytes, is copied if the step uses it.
@@ -55,7 +57,7 @@ class Moment:
         if not model.stages[position.stage].moves_host:
             state = model.replay.state_dict(prefix="replay.")
             replay = {name: v.clone() if isinstance(v, Tensor) else dict(v) for name, v in state.items()}
-        return Moment(batch, position, torch.get_rng_state(), replay)
+        return Moment(batch, position, step, torch.get_rng_state(), replay)
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class SkippedStep:
     random: Tensor
 
 
-def keep_step(run: Path, model: NeilfModel, moment: Moment, step: int) -> Path | None:
+def keep_step(run: Path, model: NeilfModel, moment: Moment) -> Path | None:
     """Store a step unless `MAX_KEPT` steps are stored already.
 
     Returns:
@@ -93,14 +95,14 @@ def keep_step(run: Path, model: NeilfModel, moment: Moment, step: int) -> Path |
         return None
     contents = {
         "format": FORMAT,
-        "step": step,
+        "step": moment.step,
         "stage": moment.position.stage.value,
         "share": moment.position.share,
         "batch": {f.name: getattr(moment.batch, f.name).cpu() for f in dataclasses.fields(PixelBatch)},
         "model": {**model.state_dict(), **moment.replay},
         "random": moment.random,
     }
-    path = folder / f"{step}.pt"
+    path = folder / f"{moment.step}.pt"
     with replacing(path) as temporary, temporary.open("wb") as file:
         torch.save(contents, file)
     return path

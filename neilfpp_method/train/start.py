@@ -152,9 +152,7 @@ def _in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Ten
 
 def _in_scene(outline: Outline, capture: Capture) -> Outline:
     """The same outline with its camera in the scene frame."""
-    return replace(
-        outline, view=replace(outline.view, camera=capture.normalisation.camera(outline.view.camera))
-    )
+    return replace(outline, view=replace(outline.view, camera=capture.scene_camera(outline.view)))
 
 
 def _rate(config: NeilfConfig) -> float:

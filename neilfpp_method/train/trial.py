@@ -39,9 +39,9 @@ from neilfpp_method.schedule import Stage, StagePosition, active_losses, stage_s
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import initial_model, scene_facts
+from neilfpp_method.train.device import waiting
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.preview import preview_pixels
-from neilfpp_method.train.work_record import waiting
 
 __all__ = ["Trial", "TrialLimits", "Workload", "run_trial"]
 

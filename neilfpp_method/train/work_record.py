@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-
-import torch
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.timing.ledger import WORK, Ledger
 from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
 
-__all__ = ["FILE", "read_work", "waiting", "write_work"]
+__all__ = ["FILE", "read_work", "write_work"]
 
 FILE = "work.json"
 FORMAT = 1
@@ -47,8 +44,3 @@ def read_work(run: Path) -> dict[str, dict[str, float]]:
                     f"{path}: {stage}.{work}: not a valid time", "remove the file, or train again"
                 )
     return stages
-
-
-def waiting(device: torch.device) -> Callable[[], object] | None:
-    """A function that waits until a device has finished its work; None if calls are synchronous."""
-    return (lambda: torch.cuda.synchronize(device)) if device.type == "cuda" else None

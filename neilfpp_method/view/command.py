@@ -12,12 +12,13 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.relight.maps import Layout, check_map, map_names, read_map
 from neilfpp_method.relight.sky import Sky
+from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.address import check_free, is_local
 from neilfpp_method.view.subject import Subject, subject_of
 
-__all__ = ["Request", "view"]
+__all__ = ["ViewRequest", "view"]
 
 MAPS = (".exr", ".hdr", ".png", ".jpg", ".jpeg")
 """Suffixes of the environment maps that are read from a folder."""
@@ -28,7 +29,7 @@ MIN_VERSION = 1
 
 
 @dataclass(frozen=True)
-class Request:
+class ViewRequest:
     """Options of the command; `commands.view.View` documents the fields."""
 
     run: Path
@@ -43,7 +44,7 @@ class Request:
 
 
 def view(
-    request: Request,
+    request: ViewRequest,
     say: Callable[[str], None] = lambda text: None,
     until: Callable[[float], bool] = lambda seconds: bool(time.sleep(seconds)),
 ) -> None:
@@ -106,14 +107,14 @@ def check_viser() -> None:
         )
 
 
-def _load(request: Request) -> Subject:
+def _load(request: ViewRequest) -> Subject:
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
     return subject_of(run, request.resolution)
 
 
-def _checkpoint_time(request: Request) -> int | None:
+def _checkpoint_time(request: ViewRequest) -> int | None:
     """Time at which the checkpoint was written, ns; None if there is no checkpoint."""
-    path = request.run / "checkpoints" / f"{request.checkpoint}.pt"
+    path = checkpoint_path(request.run, request.checkpoint)
     return path.stat().st_mtime_ns if path.is_file() else None
 
 

@@ -20,7 +20,7 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.view.pace import Pace, sizes
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
-__all__ = ["Frame", "Request", "frames"]
+__all__ = ["Frame", "PictureRequest", "frames"]
 
 BOUNCES = 4
 """Largest number of surface vertices of a path."""
@@ -35,7 +35,7 @@ FAR = 100.0
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
+class PictureRequest:
     """The view that a browser requests.
 
     Attributes:
@@ -76,7 +76,7 @@ Shader = Callable[[RayBatch, Tensor], Tensor]
 """Maps rays and their pixel indices to RGB and opacity, (N, 4)."""
 
 
-def frames(request: Request, pace: Pace) -> Iterator[Frame | None]:
+def frames(request: PictureRequest, pace: Pace) -> Iterator[Frame | None]:
     """Yield successively finer images of a request, and None between batches, when rendering may stop.
 
     Args:
@@ -98,7 +98,7 @@ def frames(request: Request, pace: Pace) -> Iterator[Frame | None]:
 
 
 def _render(
-    request: Request, camera: Camera, shader: Shader, pace: Pace, jitter: int
+    request: PictureRequest, camera: Camera, shader: Shader, pace: Pace, jitter: int
 ) -> Iterator[Tensor | None]:
     """Yield None after each batch but the last, then the values of all pixels.
 
@@ -126,7 +126,7 @@ def _render(
     yield torch.cat(done)
 
 
-def _path_shader(request: Request, camera: Camera, sample: int) -> Shader:
+def _path_shader(request: PictureRequest, camera: Camera, sample: int) -> Shader:
     """A shader that traces one path per pixel."""
     scene, pixels = scene_of(request.subject, request.light), camera.width * camera.height
     numbers = Sequence(BOUNCES * DIMENSIONS, SEED + sample).next(1, pixels, request.subject.device)
@@ -141,7 +141,7 @@ def _path_shader(request: Request, camera: Camera, sample: int) -> Shader:
     return shade
 
 
-def _layer_shader(request: Request) -> Shader:
+def _layer_shader(request: PictureRequest) -> Shader:
     """A deterministic shader of a layer."""
     subject, layer = request.subject, request.layer
     model = subject.run.model
@@ -174,7 +174,7 @@ def _opaque(color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
 
 
 def _frame(
-    request: Request, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int
+    request: PictureRequest, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int
 ) -> Frame:
     """Convert RGB and opacity to an 8-bit image over the background."""
     shape = (camera.height, camera.width)

@@ -28,7 +28,7 @@ from neilfpp_method.view.cameras import Pose, pinhole, pose_of
 from neilfpp_method.view.incident_map import Point, light_at, light_picture, point_under
 from neilfpp_method.view.pace import Pace
 from neilfpp_method.view.painter import Painter
-from neilfpp_method.view.pictures import Frame, Request, frames
+from neilfpp_method.view.pictures import Frame, PictureRequest, frames
 from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
@@ -182,7 +182,7 @@ class Session:
         camera = self.client.camera
         pose = Pose(camera.position, camera.wxyz, camera.fov, camera.aspect)
         self.painter.request(
-            Request(
+            PictureRequest(
                 subject=self.subject,
                 camera=pinhole(pose, camera.image_width, camera.image_height),
                 layer=KEYS[self.layer.value],
@@ -277,7 +277,7 @@ class Session:
     def _add_cameras(self) -> None:
         capture, self.frustums = self.subject.run.capture, []
         for view in capture.views:
-            pose = pose_of(capture.normalisation.camera(view.camera))
+            pose = pose_of(capture.scene_camera(view))
             frustum = self.client.scene.add_camera_frustum(
                 f"/cameras/{view.name}",
                 pose.fov,
@@ -303,7 +303,7 @@ class Session:
         view = next((view for view in capture.views if view.name == name), None)
         if view is None:
             return
-        self._move_camera(pose_of(capture.normalisation.camera(view.camera)))
+        self._move_camera(pose_of(capture.scene_camera(view)))
         try:
             self.photograph.image, self.photograph.visible = _photograph(view, capture.hdr), True
         # The file may have been removed since the run was loaded; the camera still moves.

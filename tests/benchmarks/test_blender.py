@@ -65,7 +65,7 @@ def own_picture(run: Run) -> tuple[np.ndarray, np.ndarray]:
     surface = Surface(triangles, torch.nn.functional.normalize(triangles, dim=-1))
     camera = next(view.camera for view in run.capture.views if view.name == VIEW)
     scene = Scene(surface, rough_paint, GGX, sky_of_run(run.model.light))
-    picture = render_picture(scene, run.capture.normalisation.camera(camera), Budget(256), bounces=1)
+    picture = render_picture(scene, run.capture.normalization.camera(camera), Budget(256), bounces=1)
     return picture.radiance.numpy(), binary_erosion(picture.alpha[..., 0].numpy() == 1)
 
 

@@ -19,6 +19,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.evaluate.render_views import view_names
+from neilfpp_method.train.checkpoint import LAST, last_checkpoint
 from tests.data.make_capture import CENTER, RADIUS
 
 
@@ -26,8 +27,8 @@ def test_train_says_what_it_does_and_leaves_a_run(trained):
     for name in ("config.json", "capture.json", "scene.json", "environment.json", "timing.json"):
         assert json.loads((trained / name).read_text())
     stages = ("sdf_init", "material_init", "joint")
-    assert {path.name for path in (trained / "checkpoints").iterdir()} == {
-        f"{s}.pt" for s in ("last", *stages)
+    assert {path.name for path in last_checkpoint(trained).parent.iterdir()} == {
+        f"{s}.pt" for s in (LAST, *stages)
     }
     assert {path.name for path in (trained / "previews").iterdir()} == {f"{s}.png" for s in stages}
     assert list(json.loads((trained / "timing.json").read_text())) == list(stages)

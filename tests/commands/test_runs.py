@@ -8,6 +8,7 @@ import shutil
 import pytest
 
 from neilfpp_method.cli import main
+from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint
 from tests.calls import refused
 
 
@@ -34,9 +35,10 @@ def test_a_folder_that_is_no_run(tmp_path, capfd, trained, name):
     refused(capfd, [name, tmp_path, "--device", "cpu"], tmp_path, "no run here", leaves=tmp_path)
     run = tmp_path / "run"
     shutil.copytree(trained, run)
-    for file, complaint in (("last.pt", "not a readable checkpoint"), ("joint.pt", "no checkpoint")):
-        path = run / "checkpoints" / file
-        path.write_bytes(b"weights") if file == "last.pt" else path.unlink()
+    damaged, missing = last_checkpoint(run), checkpoint_path(run, "joint")
+    damaged.write_bytes(b"weights")
+    missing.unlink()
+    for path, complaint in ((damaged, "not a readable checkpoint"), (missing, "no checkpoint")):
         command = [name, run, "--device", "cpu", "--checkpoint", path.stem]
         refused(capfd, command, path, complaint, leaves=tmp_path)
 
@@ -45,7 +47,7 @@ def test_a_folder_that_is_no_run(tmp_path, capfd, trained, name):
 def test_a_run_whose_capture_has_moved(tmp_path, capfd, trained, name):
     run = tmp_path / "run"
     shutil.copytree(trained, run)
-    (run / "checkpoints" / "last.pt").write_bytes((run / "checkpoints" / "sdf_init.pt").read_bytes())
+    last_checkpoint(run).write_bytes(checkpoint_path(run, "sdf_init").read_bytes())
     source = json.loads((run / "capture.json").read_text())
     (run / "capture.json").write_text(json.dumps({**source, "root": str(tmp_path / "away")}))
     command = [name, "--out", run, "--resume"] if name == "train" else [name, run]

@@ -16,6 +16,7 @@ from neilfpp_method.compare.sheet import shortened
 from neilfpp_method.compare.write import compare_runs
 from neilfpp_method.data.images import image_header, read_image
 from neilfpp_method.errors import UserError
+from neilfpp_method.train.checkpoint import last_checkpoint
 from tests.calls import train_tiny
 from tests.data.make_capture import make_capture
 
@@ -235,7 +236,7 @@ def test_runs_without_truth_have_only_figures_of_images(given, tmp_path):
 
 
 def test_a_run_before_its_first_checkpoint_is_only_in_the_table(runs, tmp_path):
-    shutil.rmtree(runs["mesh"] / "checkpoints")
+    shutil.rmtree(last_checkpoint(runs["mesh"]).parent)
     table = compare(tmp_path, runs["found"], runs["mesh"], "--views", "1", "--size", "40")
     notes = part(table, "runs")["notes"]
     assert any(

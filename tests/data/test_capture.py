@@ -44,7 +44,7 @@ def test_projection_is_k_times_w2c(tmp_path: Path) -> None:
 def test_rays_project_back_to_pixel_centers(tmp_path: Path, frame: str) -> None:
     capture = load_capture(make_capture(tmp_path))
     for view in capture.views:
-        camera = view.camera if frame == "world" else capture.normalisation.camera(view.camera)
+        camera = view.camera if frame == "world" else capture.scene_camera(view)
         rays = camera_rays(camera, torch.float64)
         assert torch.allclose(rays.directions.norm(dim=-1), torch.ones((), dtype=torch.float64))
         seen = project(camera, rays.origins + rays.directions * torch.linspace(0.5, 9, len(rays))[:, None])
@@ -54,9 +54,9 @@ def test_rays_project_back_to_pixel_centers(tmp_path: Path, frame: str) -> None:
         assert (seen.depth > 0).all()
 
 
-def test_scene_frame(tmp_path: Path) -> None:
+def test_the_scene_frame_keeps_projections(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path))
-    to_scene, to_world = capture.normalisation.to_scene, capture.normalisation.to_world
+    to_scene, to_world = capture.normalization.to_scene, capture.normalization.to_world
     north = torch.tensor([[CENTER[0], CENTER[1], CENTER[2] + RADIUS]], dtype=torch.float64)
     assert torch.allclose(to_scene(north), torch.tensor([[0, 0, RADIUS / SCALE]], dtype=torch.float64))
     points = torch.randn(2, 7, 3, dtype=torch.float64)
@@ -64,7 +64,7 @@ def test_scene_frame(tmp_path: Path) -> None:
     camera = capture.views[3].camera
     world, scene = (
         project(camera, points[0]),
-        project(capture.normalisation.camera(camera), to_scene(points[0])),
+        project(capture.normalization.camera(camera), to_scene(points[0])),
     )
     assert torch.allclose(world.pixel, scene.pixel)
     assert torch.allclose(world.depth / SCALE, scene.depth)
@@ -113,15 +113,15 @@ def test_nested_matrices_single_focals_and_other_suffixes_are_taken(tmp_path: Pa
 def test_without_a_box_the_point_cloud_defines_the_scene(tmp_path: Path) -> None:
     make_capture(tmp_path)
     edit_scene(tmp_path, lambda scene: scene.pop("bbox"))
-    normalisation = load_capture(tmp_path).normalisation
-    assert normalisation.scale == pytest.approx(RADIUS, rel=0.01)
-    assert normalisation.center == pytest.approx(CENTER, abs=0.02)
+    normalization = load_capture(tmp_path).normalization
+    assert normalization.scale == pytest.approx(RADIUS, rel=0.01)
+    assert normalization.center == pytest.approx(CENTER, abs=0.02)
 
 
 # ----------------------------------------------------------------------------------------- split and response
 
 
-def test_split(tmp_path: Path) -> None:
+def test_views_are_held_out_by_options_then_files_then_the_default(tmp_path: Path) -> None:
     make_capture(tmp_path, views=17, test=(4, 9))
 
     def held_out(**options) -> list[str]:
@@ -152,7 +152,7 @@ def test_response_comes_from_the_files_or_the_user(tmp_path: Path, hdr: bool) ->
     assert not load_capture(tmp_path, response="srgb").hdr
 
 
-def test_summary(tmp_path: Path) -> None:
+def test_the_summary_names_views_pixels_and_scene(tmp_path: Path) -> None:
     summary = load_capture(make_capture(tmp_path / "ball", masks=True)).summary.splitlines()
     assert summary[0] == "ball (sfm_scene): 6 views of 24×18, 5 to train on and 1 to test on"
     assert summary[1] == "pixels: linear HDR; mask files: 6; point cloud: oriented_pcd.ply"
@@ -173,6 +173,6 @@ def test_shared_captures(name: str) -> None:
     capture = load_capture(DATA / name)
     assert len(capture.train_views) == 32
     assert [view.index for view in capture.test_views] == [4, 9, 14, 19, 24, 29, 34, 39]
-    assert capture.normalisation.scale == pytest.approx(1.89 / 2)
+    assert capture.normalization.scale == pytest.approx(1.89 / 2)
     assert capture.hdr
     assert capture.views[0].camera.fx == pytest.approx(260.50890647)

@@ -17,7 +17,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.capture_folder import write_capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.views import CaptureFiles, Normalisation
+from neilfpp_method.data.views import CaptureFiles, Normalization
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTER, SCALE, camera_pose, make_capture
 
@@ -62,13 +62,13 @@ def test_a_written_capture_is_read_back(tmp_path: Path) -> None:
         for view in made.views
     )
     files = CaptureFiles(
-        tmp_path, folder_views, Normalisation(0.1 + 0.2, (1 / 3, -2.0, 0.0)), made.point_cloud
+        tmp_path, folder_views, Normalization(0.1 + 0.2, (1 / 3, -2.0, 0.0)), made.point_cloud
     )
     write_capture(tmp_path, files, response="srgb", test=["view 4", "view 1"])
     (tmp_path / "split.json").unlink()
     back = load_capture(tmp_path)
     assert (back.format, back.hdr, back.test) == ("neilfpp", False, {"view 1", "view 4"})
-    assert back.normalisation == files.normalisation
+    assert back.normalization == files.normalization
     assert back.point_cloud == made.point_cloud
     for new, old in zip(back.views, folder_views, strict=True):
         assert np.array_equal(new.camera.w2c, old.camera.w2c)

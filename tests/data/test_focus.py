@@ -79,9 +79,9 @@ def test_a_distant_background_does_not_define_the_box(image):
     assert box_of_points(points).scale > 10, "the box of all points holds the cameras"
     box = find_box(views, points)
     assert box.source == "focus"
-    assert box.normalisation.center == pytest.approx(tuple(PLACE), abs=1e-6)
-    assert box.normalisation.scale == pytest.approx(REACH * 4.0)
-    distances = [np.linalg.norm(box.normalisation.camera(view.camera).c2w[:, 3]) for view in views]
+    assert box.normalization.center == pytest.approx(tuple(PLACE), abs=1e-6)
+    assert box.normalization.scale == pytest.approx(REACH * 4.0)
+    distances = [np.linalg.norm(box.normalization.camera(view.camera).c2w[:, 3]) for view in views]
     assert min(distances) == pytest.approx(1 / REACH)
 
 
@@ -89,7 +89,7 @@ def test_points_that_end_before_the_cameras_define_the_box(image):
     thing = PLACE + np.random.default_rng(3).uniform(-1, 1, (500, 3))
     box = find_box(around(image), thing)
     assert box.source == "points"
-    assert box.normalisation == box_of_points(thing)
+    assert box.normalization == box_of_points(thing)
 
 
 @pytest.mark.parametrize("turned", [0.0, 0.02])

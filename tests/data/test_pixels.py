@@ -105,7 +105,7 @@ def test_samples_are_uniform_and_follow_the_global_seed(tmp_path: Path) -> None:
     assert stats.binomtest(left, 12_000, 0.5).pvalue > 1e-3
 
 
-def test_masks(tmp_path: Path) -> None:
+def test_alpha_serves_as_the_mask(tmp_path: Path) -> None:
     root = make_capture(tmp_path / "alpha")
     color = np.ones((HEIGHT, WIDTH, 4), np.float32)
     color[:, :10, 3] = 0.2

@@ -25,7 +25,7 @@ NORMAL = np.array([[0.0, 0.0, 2.0], [1.0, 0.0, 0.0]])
 
 def test_points_of_the_sphere_in_the_scene_frame(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path))
-    points = load_point_cloud(capture.point_cloud, capture.normalisation)
+    points = load_point_cloud(capture.point_cloud, capture.normalization)
     assert len(points) == 500
     assert torch.allclose(points.position.norm(dim=-1), torch.tensor(RADIUS / SCALE), atol=1e-6)
     assert torch.allclose(points.normal, torch.nn.functional.normalize(points.position, dim=-1), atol=1e-5)

@@ -33,7 +33,7 @@ def test_points_define_the_box_in_spite_of_outliers() -> None:
 
 
 def test_the_visual_hull_contains_the_object_closely(tmp_path: Path) -> None:
-    box = find_box(views(tmp_path, masks=True, count=16)).normalisation
+    box = find_box(views(tmp_path, masks=True, count=16)).normalization
     assert np.allclose(box.center, CENTER, atol=0.15 * RADIUS)
     assert RADIUS < box.scale < 1.3 * RADIUS
     assert np.abs(sphere_points() - box.center).max() <= box.scale
@@ -57,7 +57,7 @@ def test_the_most_reliable_source_is_used(tmp_path: Path) -> None:
 
 def test_points_outside_the_masks_are_ignored(tmp_path: Path) -> None:
     table = CENTER + np.random.default_rng(1).uniform(-4, 4, (4000, 3)) * [1, 1, 0] - [0, 0, RADIUS]
-    box = find_box(views(tmp_path, masks=True), np.concatenate([sphere_points(), table])).normalisation
+    box = find_box(views(tmp_path, masks=True), np.concatenate([sphere_points(), table])).normalization
     assert np.allclose(box.center, CENTER, atol=0.15 * RADIUS)
     assert box.scale < 1.3 * RADIUS
 
@@ -70,7 +70,7 @@ def test_alpha_serves_as_mask(tmp_path: Path) -> None:
         return replace(view, image=image, mask=None)
 
     masked = views(tmp_path, masks=True)
-    assert find_box([with_alpha(view) for view in masked]).normalisation == find_box(masked).normalisation
+    assert find_box([with_alpha(view) for view in masked]).normalization == find_box(masked).normalization
 
 
 def test_opaque_images_have_no_silhouettes(tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_opaque_images_have_no_silhouettes(tmp_path: Path) -> None:
     assert find_box([opaque(view) for view in masked]).source == "cameras"
     one = find_box([opaque(masked[0]), *masked[1:]])  # a close-up, perhaps
     assert one.source == "masks"
-    assert one.normalisation.scale == pytest.approx(find_box(masked).normalisation.scale, rel=0.1)
+    assert one.normalization.scale == pytest.approx(find_box(masked).normalization.scale, rel=0.1)
     assert find_box([*map(opaque, masked[:9]), *masked[9:]]).source == "cameras"
 
 

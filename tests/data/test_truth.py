@@ -64,7 +64,7 @@ def test_three_equal_channels_are_one(truth: Truth) -> None:
         truth.material(view)
 
 
-def test_mesh(truth: Truth) -> None:
+def test_the_true_mesh_is_in_the_scene_frame(truth: Truth) -> None:
     mesh = truth.mesh()
     assert mesh.faces.shape == (1280, 3)  # an icosahedron's 20 faces, each split in 4 three times
     assert torch.allclose(mesh.vertices.norm(dim=-1), torch.tensor(SPHERE), atol=1e-5)
@@ -79,14 +79,14 @@ def light_field(points: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def test_light_field(truth: Truth) -> None:
+def test_a_light_field_is_read_in_the_scene_frame_and_checked(truth: Truth) -> None:
     (truth.capture.root / "light").mkdir()
     path = truth.capture.root / "light" / "light_field_gt.npz"
     points = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
     np.savez(path, **light_field(points))
     field = truth.light_field()
     assert torch.allclose(
-        truth.capture.normalisation.to_world(field.position), torch.from_numpy(points), atol=1e-6
+        truth.capture.normalization.to_world(field.position), torch.from_numpy(points), atol=1e-6
     )
     assert field.incident.shape == (4, 5, 3)
     assert field.material.roughness.shape == (4, 1)

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.effects.place_fit import ROWS
+from neilfpp_method.effects.place_data import ROWS, PlaceData, place_transport
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.transport import from_texels
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, Observed
 
@@ -47,6 +47,12 @@ def ball(
     )
     place = torch.arange(count).repeat_interleave(views)
     return Places(count, place, torch.arange(views).repeat(count), Observed(normal, normal, wo, pixel))
+
+
+def data_of(places: Places, lobe: Lobe) -> PlaceData:
+    """The data of a fit to places that have no neighbours in the way of their light."""
+    typical = places.observed.pixel.median().item()
+    return PlaceData(places, place_transport(places, lobe, None), typical)
 
 
 def _rendered(

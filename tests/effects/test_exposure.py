@@ -27,7 +27,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading.color import apply_response, linear_to_srgb, srgb_to_linear
-from neilfpp_method.train.build import build_model, exposures_of, scene_facts
+from neilfpp_method.train.build import build_model, exposures_at_cloud, scene_facts
 from tests.data.make_capture import make_capture, srgb
 from tests.scenes import sphere_batch, tiny_config
 
@@ -53,7 +53,7 @@ def photographs(root: Path, hdr: bool, log_gains: np.ndarray):
 @pytest.mark.parametrize("hdr", [True, False])
 def test_gains_of_photographs_are_recovered(tmp_path, hdr):
     capture = photographs(tmp_path / "sphere", hdr, LOG_GAINS)
-    found = exposures_of(capture, PixelDataset(capture, capture.train_views))
+    found = exposures_at_cloud(capture, PixelDataset(capture, capture.train_views))
     true = torch.from_numpy(LOG_GAINS - LOG_GAINS.mean(0)).float()
     torch.testing.assert_close(found.log_gain, true, atol=0.03, rtol=0.0)
     assert found.measured.favours(chosen=False)
@@ -66,7 +66,7 @@ def test_photographs_of_equal_exposure_need_no_gains(tmp_path):
         PixelDataset(capture, capture.train_views),
         Plan.begin(parse_effects("auto"), preset("fast")),
     )
-    found = exposures_of(capture, pixels)
+    found = exposures_at_cloud(capture, pixels)
     assert abs(found.measured.value) < 0.005
     record_exposures(plan, found)
     decision = plan.newest("exposure")
@@ -84,7 +84,7 @@ def test_photographs_of_equal_exposure_need_no_gains(tmp_path):
 def test_without_a_cloud_nothing_is_measured(tmp_path):
     capture = dataclasses.replace(load_capture(make_capture(tmp_path / "sphere")), point_cloud=None)
     plan = Plan.begin(parse_effects("auto"), preset("fast"))
-    record_exposures(plan, exposures_of(capture, PixelDataset(capture, capture.train_views)))
+    record_exposures(plan, exposures_at_cloud(capture, PixelDataset(capture, capture.train_views)))
     assert not plan.is_on("exposure")
     asked = Plan.begin(parse_effects("+exposure"), preset("paper-mlp"))
     record_exposures(asked, None)

@@ -12,13 +12,13 @@ from neilfpp_method.effects.lamps import LampTrial
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.metals import metals_evidence
-from neilfpp_method.effects.place_fit import ROWS, place_transport
+from neilfpp_method.effects.place_data import ROWS
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Material, Observed
-from tests.effects.balls import ball, sky
+from tests.effects.balls import ball, data_of, sky
 from tests.scenes import sphere_model
 
 COUNT, VIEWS = 110, 7
@@ -41,17 +41,16 @@ def log_distance(log_radiance: torch.Tensor) -> float:
 
 
 def test_scale_and_map_are_found_together():
-    places, lobe = patched("ggx"), LOBES["ggx"]
-    typical = places.observed.pixel.median().item()
-    found = find_first_light(places, place_transport(places, lobe, None), typical, metals=True)
+    data = data_of(patched("ggx"), LOBES["ggx"])
+    found = find_first_light(data, metals=True)
     torch.manual_seed(1)
     truth = (0.2 + 0.6 * torch.rand(COUNT, 3)).log().mean().exp().item()
     assert abs(math.log(found.scale / truth)) < math.log(1.35)
-    start = torch.full((3, ROWS, 2 * ROWS), math.log(typical / truth))
+    start = torch.full((3, ROWS, 2 * ROWS), math.log(data.typical / truth))
     assert log_distance(found.log_radiance) < 0.6 * log_distance(start)
     assert found.places == COUNT
     assert f"{COUNT} places" in found.summary()
-    assert len(found.observed) == len(found.material.roughness) <= len(places.place)
+    assert len(found.observed) == len(found.material.roughness) <= len(data.places.place)
     assert (found.material.base_color == found.mean.base_color).all()
 
 
@@ -73,9 +72,7 @@ def test_held_back_views_distinguish_metals_from_paint():
     lobe = LOBES["ggx"]
 
     def gain(places: Places) -> Measurement:
-        return metals_evidence(
-            places, place_transport(places, lobe, None), places.observed.pixel.median().item()
-        )
+        return metals_evidence(data_of(places, lobe))
 
     mixed = gain(patched("ggx"))
     assert mixed.favours(chosen=True)
@@ -90,7 +87,7 @@ def test_held_back_views_distinguish_metals_from_paint():
 def test_too_few_places_give_no_initial_light():
     places = patched("ggx")
     few = places.where(torch.nonzero(places.place < MIN_PLACES - 1)[:, 0])
-    assert find_first_light(few, place_transport(few, LOBES["ggx"], None), 1.0, metals=True) is None
+    assert find_first_light(data_of(few, LOBES["ggx"]), metals=True) is None
 
 
 def test_lowest_is_the_minimum_of_the_parabola_over_the_logarithm():
@@ -116,11 +113,11 @@ def test_an_untrained_field_starts_at_the_estimated_material():
 def test_a_model_starts_with_the_estimated_map():
     model = sphere_model(preset("fast"))
     none = torch.zeros(0, 3)
-    grey = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))
+    gray = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))
     unseen = Observed(none, none, none, none), Material(none, none[:, :1], none[:, :1])
     places = ball(torch.ones(1, 3), torch.ones(1, 1), torch.zeros(1, 1), None)
-    trial = LampTrial(*[places, place_transport(places, LOBES["ggx"], None)] * 2, 1.0, pytest.fail)
-    found = FirstLight(sky().log_radiance, grey, {0.33: 0.1}, 0.33, COUNT, *unseen, trial)
+    trial = LampTrial(data_of(places, LOBES["ggx"]).hold_back(0, 2), pytest.fail)
+    found = FirstLight(sky().log_radiance, gray, {0.33: 0.1}, 0.33, COUNT, *unseen, trial)
     start_with(model, found)
     coarse = model.light.at_most(ROWS).log_radiance
     assert (coarse - sky().log_radiance).abs().median() < 0.1

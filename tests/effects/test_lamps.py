@@ -8,18 +8,18 @@ import pytest
 import torch
 
 from neilfpp_method.effects.first_light import find_first_light
-from neilfpp_method.effects.place_fit import place_transport
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import record_lamps
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.lamps import LampPlaces, Lamps
+from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.fit import Evidence
-from neilfpp_method.lighting.transport import from_lamps, from_texels
+from neilfpp_method.lighting.lamp_transport import from_lamps
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Material, Observed
-from tests.effects.balls import ball
+from tests.effects.balls import ball, data_of
 from tests.scenes import sphere_model
 
 LOBE = LOBES["ggx"]
@@ -34,9 +34,8 @@ def lamp(position: tuple[float, float, float], intensity: float) -> Lamps:
 
 def lit_by(lamps: Lamps, observed: Observed, material: Material) -> Observed:
     """The same points with the light of the lamps added to their pixels."""
-    places = LampPlaces(lamps.position[: lamps.count], lamps.axis[: lamps.count])
-    sent = from_lamps(places, lamps.radius, observed, material.roughness, LOBE, None)
-    added = sent.outgoing(material, lamps.intensity[: lamps.count])
+    sent = from_lamps(lamps.lit_places, lamps.radius, observed, material.roughness, LOBE, None)
+    added = sent.outgoing(material, lamps.lit_intensity)
     return dataclasses.replace(observed, pixel=observed.pixel + added)
 
 
@@ -48,8 +47,7 @@ def test_a_lamp_explains_held_back_views_only_if_there_is_one(with_lamp):
     if with_lamp:
         material = Material(*(v[places.place] for v in (color, ROUGHNESS * ones, 0 * ones)))
         places = dataclasses.replace(places, observed=lit_by(lamps, places.observed, material))
-    typical = places.observed.pixel.median().item()
-    found = find_first_light(places, place_transport(places, LOBE, None), typical, metals=False)
+    found = find_first_light(data_of(places, LOBE), metals=False)
     measured = found.lamp_trial(lamps, LOBE, None)
     assert measured.in_views
     assert measured.points == COUNT

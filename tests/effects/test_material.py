@@ -10,22 +10,14 @@ import torch
 from neilfpp_method.effects.material import WORTH, judge_material
 from neilfpp_method.effects.material_grid import METALLICS
 from neilfpp_method.effects.noise import lobe_noise
-from neilfpp_method.effects.place_fit import (
-    DIRECTIONS,
-    ROWS,
-    PlaceFit,
-    fit_places,
-    place_errors,
-    place_transport,
-)
+from neilfpp_method.effects.place_data import ROWS
+from neilfpp_method.effects.place_fit import Permitted, PlaceFit, fit_places, place_errors
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.transport import from_texels, from_texels_at
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES, Lobe
-from neilfpp_method.structures import Observed, SceneLight
-from tests.effects.balls import ball, sky
+from tests.effects.balls import ball, data_of, sky
 from tests.scenes import sphere_model, tiny_config
 from tests.train.small_runs import solved_light
 
@@ -48,17 +40,9 @@ def gain_of_metals(places: Places) -> tuple[float, float]:
     """Mean reduction of the error in held-back views by metals, and the share of places that are then
     metal.
     """
-    transport = place_transport(places, LOBE, None)
-    typical = places.observed.pixel.median().item()
-    back = places.view % 3 == 0
-    known, kept = torch.nonzero(~back)[:, 0], torch.nonzero(back)[:, 0]
-    paint, metal = (
-        fit_places(places.where(known), transport[known], typical, metals) for metals in (False, True)
-    )
-    errors = [
-        place_errors(fit, places.where(kept), transport[kept], typical).mean().item()
-        for fit in (paint, metal)
-    ]
+    split = data_of(places, LOBE).hold_back(0, 3)
+    paint, metal = (fit_places(split.known, Permitted(metals)) for metals in (False, True))
+    errors = [place_errors(fit, split.held_back).mean().item() for fit in (paint, metal)]
     assert paint.metallic.max() == 0
     return errors[0] - errors[1], (metal.metallic > len(METALLICS) // 2).float().mean().item()
 
@@ -73,9 +57,7 @@ def test_metals_reduce_the_error_for_a_metal_ball_and_not_for_a_painted_one():
 
 
 def judged(places: Places, *names: str) -> dict:
-    typical = places.observed.pixel.median().item()
-    transport = place_transport(places, LOBE, None)
-    return judge_material(places, transport, typical, frozenset(names), metals=False).measured
+    return judge_material(data_of(places, LOBE), frozenset(names), metals=False).measured
 
 
 def test_specular_reflection_is_found_on_a_shiny_ball_and_not_on_a_dull_one():
@@ -124,40 +106,6 @@ def test_a_single_roughness_is_the_same_everywhere_and_is_trained():
     assert field.mlp.layers[-1].weight.grad is None
 
 
-def test_transport_at_several_roughnesses_agrees_with_each_alone():
-    observed, place = ball_of(0.0).observed[:20], torch.arange(20)
-    environment = EnvironmentLight(48, 1.0)
-    torch.manual_seed(3)
-    draws = [
-        from_texels_at(environment, observed, observed, place, (0.3, 0.7), LOBE, None) for _ in range(16)
-    ]
-    both = torch.stack([drawn.sources.float() for drawn in draws]).mean(0)
-    for k, roughness in enumerate((0.3, 0.7)):
-        rough = torch.full((20, 1), roughness)
-        alone = torch.stack(
-            [from_texels(environment, observed, rough, LOBE, None).sources for _ in range(16)]
-        ).mean(0)
-        # Summed over the texels: single ones are noisy.
-        expected = alone.sum(-1)
-        torch.testing.assert_close(both[[0, 1 + 2 * k, 2 + 2 * k]].sum(-1), expected, rtol=0.05, atol=5e-3)
-
-
-def test_rays_are_traced_once_per_place():
-    places = ball_of(0.0)
-    rays = []
-
-    def scene(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:
-        rays.append(wi.shape[0] * wi.shape[1])
-        up = wi[..., 2] > 0.5
-        return SceneLight(up, up[..., None] * torch.ones(3), torch.where(up, 1.0, torch.inf))
-
-    transport = place_transport(places, LOBE, scene)
-    assert sum(rays) == DIRECTIONS * places.count * ROWS**2
-    open_sky = place_transport(places, LOBE, None)
-    assert transport.sources.sum() < open_sky.sources.sum()
-    assert (transport.scene[0] > 0).any()
-
-
 def test_without_metals_metallic_is_zero_and_not_trained():
     config = preset("fast")
     field = BrdfField(config.brdf, config.encoding, 1.0)
@@ -170,11 +118,3 @@ def test_without_metals_metallic_is_zero_and_not_trained():
     field(x).metallic.sum().backward() if field(x).metallic.requires_grad else None
     assert field(x).roughness.requires_grad
     assert field.mlp.layers[-1].bias.grad is None or field.mlp.layers[-1].bias.grad[4] == 0
-
-
-def test_means_are_computed_per_place():
-    values = torch.tensor([1.0, 3.0, 5.0])
-    nothing = Observed(*[torch.zeros(3, 3)] * 4)
-    places = Places(3, torch.tensor([0, 0, 2]), torch.arange(3), nothing)
-    assert places.mean(values).tolist() == [2.0, 0.0, 5.0]
-    assert places.where(torch.tensor([1])).mean(values[1:2]).tolist() == [3.0, 0.0, 0.0]

@@ -8,7 +8,6 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.material_search import (
     SEARCH_AT,
     SearchedMaterial,
@@ -19,9 +18,6 @@ from neilfpp_method.effects.material_search import (
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.lamps import LampPlaces
-from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.transport import arriving_at, from_lamps, from_texels_at
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
@@ -136,24 +132,3 @@ def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():
     for name in ("base_color", "roughness", "metallic"):
         off = (getattr(learned, name) - getattr(material, name)).abs()
         assert off.median() < 0.03, name
-
-
-def test_light_at_several_roughnesses_is_the_transport_times_the_light(places: Places):
-    observed, place = places.observed[:40], torch.arange(40)
-    model = trained_to(PAINT, places)
-    model.lamps.place(torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 5.0))
-    arguments = (observed, observed, place, ROUGHNESSES[:3], LOBE, None)
-    torch.manual_seed(0)
-    arriving = arriving_at(LightModel(model.light, model.lamps), *arguments)
-    torch.manual_seed(0)
-    transport = from_texels_at(model.light, *arguments)
-    radiance = model.light.log_radiance.exp().flatten(1).t()
-    expected = transport.sources.float() @ radiance
-    lamp = LampPlaces(model.lamps.position[:1], model.lamps.axis[:1])
-    for number, value in enumerate(ROUGHNESSES[:3]):
-        rough = torch.full((40, 1), value)
-        lamps = from_lamps(lamp, model.lamps.radius, observed, rough, LOBE, None).sources
-        sent = lamps @ model.lamps.intensity[:1]
-        expected[1 + 2 * number : 3 + 2 * number] += sent[1:]
-        expected[0] += sent[0] if number == 0 else 0
-    torch.testing.assert_close(arriving, expected, rtol=1e-4, atol=1e-5)

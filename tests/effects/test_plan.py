@@ -20,7 +20,7 @@ from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields import environment
 from neilfpp_method.fields.direction_map import interpolate
-from neilfpp_method.lighting import solve
+from neilfpp_method.lighting import fit, solve
 from neilfpp_method.lighting.fit import Evidence, fit_light
 from neilfpp_method.schedule import Stage, active_losses
 from neilfpp_method.settings.plain import changed
@@ -130,7 +130,7 @@ def test_an_even_light_has_no_look_ups_and_one_source(monkeypatch):
     )
     looked_up, sources = [], []
     monkeypatch.setattr(environment, "interpolate", lambda *a: looked_up.append(a) or interpolate(*a))
-    monkeypatch.setattr(solve, "fit_light", lambda *a: sources.append(a[1].sources.shape[2]) or fit_light(*a))
+    monkeypatch.setattr(fit, "fit_light", lambda *a: sources.append(a[1].sources.shape[2]) or fit_light(*a))
     solver = model.light_solver()
     while not solver.due:
         solver.observe(model.step(sphere_batch(), Stage.MATERIAL_INIT))

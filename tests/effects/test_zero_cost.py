@@ -11,7 +11,7 @@ from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.hosts.volsdf import VolSdfHost
-from neilfpp_method.lighting import solve
+from neilfpp_method.lighting import fit
 from neilfpp_method.lighting.fit import fit_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, stage_steps
@@ -34,7 +34,7 @@ def settings(effects: str) -> NeilfConfig:
 @pytest.mark.parametrize("lamps", [True, False])
 def test_without_lamps_there_is_one_fit_and_no_candidate(lamps, monkeypatch):
     model, sources = sphere_model(settings("all" if lamps else "all,-lamps")), []
-    monkeypatch.setattr(solve, "fit_light", lambda *a: sources.append(a[1].sources.shape[2]) or fit_light(*a))
+    monkeypatch.setattr(fit, "fit_light", lambda *a: sources.append(a[1].sources.shape[2]) or fit_light(*a))
     solver = model.light_solver()
     while not solver.due:
         solver.observe(model.step(sphere_batch(), Stage.MATERIAL_INIT))

@@ -32,7 +32,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import RADIUS, SCALE, make_capture
-from tests.scenes import tiny_config
+from tests.scenes import meet_ball, tiny_config
 
 SPHERE = RADIUS / SCALE  # radius in the scene frame
 
@@ -41,11 +41,8 @@ class Ball:
     """The sphere of `make_capture` as a white host with a sharp surface."""
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        middle = -(rays.origins * rays.directions).sum(-1)
-        inside = middle.square() - rays.origins.square().sum(-1) + SPHERE**2
-        depth = middle - inside.clamp_min(0).sqrt()
-        hit = ((inside > 0) & (depth > 0)).float()
-        position = rays.origins + (depth * hit)[:, None] * rays.directions
+        position, hit = meet_ball(rays, SPHERE)
+        position = torch.where(hit[:, None] > 0, position, rays.origins)
         return SurfaceHits(hit[:, None].expand(-1, 3), position, hit[:, None] * position / SPHERE, hit, hit)
 
 

@@ -55,10 +55,10 @@ def test_a_perfect_estimate_scores_100_db(measure):
 
 
 def test_ssim_of_constant_images():
-    a, b, stabiliser = 0.3, 0.6, 0.01**2
+    a, b, stabilizer = 0.3, 0.6, 0.01**2
     estimate, truth = np.full((16, 16, 3), a), np.full((16, 16, 3), b)
-    expected = (2 * a * b + stabiliser) / (
-        a * a + b * b + stabiliser
+    expected = (2 * a * b + stabilizer) / (
+        a * a + b * b + stabilizer
     )  # without variance only the means are compared
     assert metrics.ssim(estimate, truth, np.ones((16, 16), bool)) == pytest.approx(expected, abs=1e-6)
 

@@ -169,7 +169,7 @@ def test_rings_mark_the_lamps_above_the_surface(root: Path, tmp_path: Path):
     lit = Path(shutil.copytree(root, tmp_path / "lit"))
     write_light_field(lit, lambda wi: 0 * wi + 1.0)  # at the world's origin, facing along x, y and z
     run = make_run(lit)
-    origin = run.capture.normalisation.to_scene(torch.zeros(3))
+    origin = run.capture.normalization.to_scene(torch.zeros(3))
     run.model.lamps = Lamps(4, 0.06)
     run.model.lamps.place(origin + torch.tensor([[2.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), torch.ones(2, 3))
     pictures = [

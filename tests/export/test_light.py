@@ -22,7 +22,7 @@ from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import OrientedPoints, RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import CENTER, SCALE, make_capture
-from tests.scenes import tiny_config
+from tests.scenes import meet_ball, tiny_config
 
 RADIUS = 0.6
 POSITION = torch.tensor([[0.9, 0.0, 0.3], [-0.2, 0.8, 0.4]])
@@ -38,15 +38,9 @@ class Ball(torch.nn.Module):
         self.radius = radius
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        along = (rays.origins * rays.directions).sum(-1)
-        square = along**2 - rays.origins.square().sum(-1) + self.radius**2
-        hit = (square > 0) & (along < 0)
-        distance = -along - square.clamp_min(0).sqrt()
-        position = torch.where(hit[:, None], rays.origins + distance[:, None] * rays.directions, rays.origins)
-        share = hit.float()
-        return SurfaceHits(
-            torch.zeros_like(position), position, position / RADIUS * share[:, None], share, share
-        )
+        position, hit = meet_ball(rays, self.radius)
+        position = torch.where(hit[:, None] > 0, position, rays.origins)
+        return SurfaceHits(torch.zeros_like(position), position, position / RADIUS * hit[:, None], hit, hit)
 
 
 def make_run(folder: Path, kind: str, step: int = 12, radius: float = RADIUS) -> Run:

@@ -139,9 +139,9 @@ def test_export_keeps_vertices_at_map_coordinates(tmp_path: Path):
     run = make_run(tmp_path, Ball(), step=4)
     offset = np.array([5e6, 4e5, 0.0])
     moved = dataclasses.replace(
-        run.capture.normalisation, center=tuple(np.array(run.capture.normalisation.center) + offset)
+        run.capture.normalization, center=tuple(np.array(run.capture.normalization.center) + offset)
     )
-    far = dataclasses.replace(run, capture=dataclasses.replace(run.capture, normalisation=moved))
+    far = dataclasses.replace(run, capture=dataclasses.replace(run.capture, normalization=moved))
     export_mesh(run, tmp_path / "near.ply", resolution=32)
     export_mesh(far, tmp_path / "far.ply", resolution=32)
     near, far = (trimesh.load_mesh(tmp_path / f"{name}.ply", process=False) for name in ("near", "far"))

@@ -42,7 +42,7 @@ def keep_first(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -
 @pytest.fixture
 def samples_stay(monkeypatch):
     keep_first(monkeypatch, volsdf_module, "error_bounded_samples")
-    keep_first(monkeypatch, model_module, "draw_directions")
+    keep_first(monkeypatch, model_module, "sample_directions")
 
 
 def small_model(light: str) -> NeilfModel:
@@ -112,7 +112,7 @@ def test_renders_of_the_host(samples_stay, output):
 
 @pytest.mark.parametrize("light", ["free", "map"])
 @pytest.mark.parametrize("stage", list(Stage))
-def test_losses_of_a_step(samples_stay, light, stage):
+def test_slopes_of_all_losses_of_a_step_agree_with_differences(samples_stay, light, stage):
     """All losses of a stage together, with their weights, and all fields that the stage trains."""
     model, batch = small_model(light), pixels()
     model.freeze_for(stage)

@@ -45,7 +45,7 @@ def gradients(loss: torch.Tensor, module: torch.nn.Module, *inputs: torch.Tensor
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
-def test_sdf(name, dtype):
+def test_distances_and_their_gradients_are_bounded(name, dtype):
     torch.manual_seed(0)
     field = SdfField(preset(name).host.sdf, preset(name).encoding, 1.75).to(dtype)
     x = POSITIONS.to(dtype).requires_grad_()
@@ -57,7 +57,7 @@ def test_sdf(name, dtype):
 
 @pytest.mark.parametrize("method", ["analytic", "finite_difference"])
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
-def test_hessian(name, method):
+def test_hessians_and_their_gradients_are_bounded(name, method):
     torch.manual_seed(0)
     field = SdfField(preset(name).host.sdf, preset(name).encoding, 1.75)
     hessian = field.hessian(POSITIONS[:6], method)
@@ -66,7 +66,7 @@ def test_hessian(name, method):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
-def test_brdf(name, dtype):
+def test_materials_and_their_gradients_are_bounded(name, dtype):
     torch.manual_seed(0)
     field = BrdfField(preset(name).brdf, preset(name).encoding, 1.75).to(dtype)
     x = POSITIONS[:6].to(dtype).requires_grad_()
@@ -93,7 +93,7 @@ def test_outgoing_radiance(name, dtype):
 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("name", ["fast", "paper-mlp"])
-def test_incident_light(name, dtype):
+def test_incident_radiance_is_positive_and_bounded(name, dtype):
     torch.manual_seed(0)
     field = IncidentLightField(LIT[name].light, LIT[name].encoding, 10.0, 1.0).to(dtype)
     x = POSITIONS[:6].to(dtype).requires_grad_()

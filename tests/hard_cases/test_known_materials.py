@@ -24,7 +24,7 @@ from neilfpp_method.attach import AttachedNeilf, attach_neilf, pixel_batch
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.shading import sample_directions, shade
+from neilfpp_method.shading import Sampling, sample_directions, shade
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Incident, Material, PixelBatch, RayBatch
 from tests.data.make_capture import srgb
@@ -279,7 +279,9 @@ def test_shading_agrees_with_the_quadrature(roughness, metallic):
     light = EnvironmentLight(16, 1.0)
     light.show(torch.from_numpy(ball.environment).float().permute(2, 0, 1))
     made_of = Material(base_color, torch.full((100, 1), roughness), torch.full((100, 1), metallic))
-    drawn = sample_directions("mis", n, wo, made_of.roughness, 1024, GGX, True, light=light.technique(n))
+    drawn = sample_directions(
+        Sampling("mis", 1024, GGX, stochastic=True), n, wo, made_of.roughness, light.technique(n)
+    )
     shaded = shade(made_of, n, wo, Incident.of(drawn, light.radiance(n, drawn.wi)), GGX).color
     assert (shaded - wanted).abs().mean() < 0.02 * wanted.mean()
     assert shaded.mean().item() == pytest.approx(wanted.mean().item(), rel=3e-3)

@@ -11,9 +11,10 @@ import torch
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
-from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.fit import MapAndLamps, fit_light
+from neilfpp_method.lighting.lamp_transport import from_lamps, in_sight, lamp_kernel
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.transport import from_lamps, from_texels, in_sight, lamp_kernel
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material, Observed
 from tests.hard_cases.test_fields import DTYPES, assert_bounded
@@ -105,7 +106,7 @@ def test_a_fit_to_impossible_observations(pixel, base_color, metallic):
     carried = from_texels(sky, seen, rough, GGX, None).concatenate(
         from_lamps(LAMPS, RADIUS, seen, rough, GGX, None)
     )
-    start = Light(sky.log_radiance, torch.zeros(3, 3))
+    start = MapAndLamps(sky.log_radiance, torch.zeros(3, 3))
     target = Target(seen.position, material, torch.full((count, 3), pixel))
     found = fit_light(start, carried, target, Objective("linear", max(pixel, 1.0), steps=50))
     assert_bounded(found.log_radiance, found.intensity, bound=1e12)

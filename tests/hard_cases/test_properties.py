@@ -16,15 +16,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from neilfpp_method.data.views import Camera, Normalisation, camera_rays, project
+from neilfpp_method.data.views import Camera, Normalization, camera_rays, project
 from neilfpp_method.fields.encodings import direction_encoding, position_encoding
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import LampPlaces
-from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.fit import MapAndLamps, fit_light
+from neilfpp_method.lighting.lamp_transport import from_lamps
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
-from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig
-from neilfpp_method.shading import LOBES, evaluate, sample_directions, srgb_to_linear
+from neilfpp_method.shading import LOBES, Sampling, evaluate, sample_directions, srgb_to_linear
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.color import linear_to_srgb, residual
 from neilfpp_method.structures import Material
@@ -149,7 +150,7 @@ def test_samplers_draw_unit_directions_of_finite_density(
 ):
     n, wo = direction(normals, dtype), direction(to_viewer, dtype)
     roughness = torch.from_numpy(rough).to(dtype)
-    drawn = sample_directions(kind, n, wo, roughness, count, GGX, stochastic=moves)
+    drawn = sample_directions(Sampling(kind, count, GGX, stochastic=moves), n, wo, roughness)
     assert drawn.wi.shape == (ROWS, count, 3)
     # Normals of half precision are themselves off unit length by half a unit in the last place.
     assert (drawn.wi.norm(dim=-1) - 1).abs().max() < max(1e-5, 8 * torch.finfo(dtype).eps)
@@ -324,7 +325,7 @@ def test_rays_project_back_to_their_pixels(dtype, uv, log_scale, away, focal, ce
     middle = away * scale * np.array([0.6, 0.0, -0.8])
     w2c[:3, 3] = -w2c[:3, :3] @ (middle - 3.0 * scale * forward)
     camera = Camera(8 * focal, 8 * focal, *(8 * center), 8, 6, w2c)
-    scene = Normalisation(scale, tuple(middle)).camera(camera)
+    scene = Normalization(scale, tuple(middle)).camera(camera)
     rays = camera_rays(scene, dtype)
     assert_finite(rays.origins, bound=3.1)
     torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(48, dtype=dtype))
@@ -360,7 +361,7 @@ def test_a_light_fit_is_finite_and_not_negative(pixel, firefly, count, seed):
     )
     target = Target(seen.position, made_of, color)
     objective = Objective("linear", max(pixel, 1e-3), steps=20)
-    found = fit_light(Light(sky.log_radiance, torch.zeros(1, 3)), carried, target, objective)
+    found = fit_light(MapAndLamps(sky.log_radiance, torch.zeros(1, 3)), carried, target, objective)
     assert_finite(found.log_radiance, bound=100.0)
     assert_finite(found.intensity, bound=1e18)
     assert found.intensity.min() >= 0
@@ -377,7 +378,7 @@ def test_a_light_fit_follows_the_unit_of_the_images(exponent, seed):
         carried = from_texels(sky, seen, made_of.roughness, GGX, None)
         pixel = unit_of_images * (0.2 + seen.normal[:, 2:].clamp_min(0)).expand(40, 3)
         objective = Objective("linear", 0.5 * unit_of_images, steps=20)
-        start = Light(sky.log_radiance, torch.zeros(0, 3))
+        start = MapAndLamps(sky.log_radiance, torch.zeros(0, 3))
         target = Target(seen.position, made_of, pixel)
         found.append(fit_light(start, carried, target, objective).log_radiance)
     torch.testing.assert_close(found[1], found[0] + exponent * math.log(2), rtol=1e-3, atol=1e-3)

@@ -11,7 +11,7 @@ from scipy import stats
 
 from neilfpp_method.fields.direction_map import texels_of
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.shading import sample_directions
+from neilfpp_method.shading import Sampling, sample_directions
 from neilfpp_method.shading.brdf import LOBES
 from tests import oracles
 from tests.hard_cases.known_ball import sky
@@ -39,7 +39,11 @@ def test_a_million_directions(kind, lobe, view):
     many = points(NORMALS[view], (0.0, 0.0, 1.0), SAMPLES // count, ROUGHNESS)
     one = tuple(t[:1] for t in many)
     result = oracles.chi2_test(
-        lambda: sample_directions(kind, *many, count, LOBES[lobe], True).wi.reshape(-1, 3).numpy(),
+        lambda: (
+            sample_directions(Sampling(kind, count, LOBES[lobe], stochastic=True), *many)
+            .wi.reshape(-1, 3)
+            .numpy()
+        ),
         lambda wi: density(kind, LOBES[lobe], torch.from_numpy(wi)[None], *one)[0].numpy(),
         tests=TESTS,
     )

@@ -9,7 +9,15 @@ import itertools
 import pytest
 import torch
 
-from neilfpp_method.shading import LOBES, apply_response, evaluate, sample_directions, shade, srgb_to_linear
+from neilfpp_method.shading import (
+    LOBES,
+    Sampling,
+    apply_response,
+    evaluate,
+    sample_directions,
+    shade,
+    srgb_to_linear,
+)
 from neilfpp_method.shading.color import linear_to_srgb
 from neilfpp_method.structures import Incident, IncidentSamples, Material
 
@@ -65,7 +73,7 @@ def assert_tame(value: torch.Tensor, leaves: dict[str, torch.Tensor], bound: flo
 @dtypes
 @lobes
 @pytest.mark.parametrize("part", ["diffuse", "specular"])
-def test_brdf(lobe, dtype, part):
+def test_the_brdf_is_bounded_and_not_negative(lobe, dtype, part):
     leaf, material, wo, wi = hard_scene(dtype)
     value = getattr(evaluate(material, leaf["n"], wo, wi, LOBES[lobe]), part)
     assert_tame(value, leaf, BOUND[dtype])
@@ -76,7 +84,7 @@ def test_brdf(lobe, dtype, part):
 @dtypes
 @lobes
 @pytest.mark.parametrize("light", [0.0, 1e6])
-def test_shade(lobe, dtype, light):
+def test_shaded_radiance_is_bounded_and_not_negative(lobe, dtype, light):
     leaf, material, wo, wi = hard_scene(dtype)
     leaf["radiance"] = torch.full_like(wi, light).requires_grad_()
     samples = IncidentSamples(wi, torch.full_like(wi[..., 0], 0.159))
@@ -98,10 +106,12 @@ def test_a_pdf_of_zero_causes_no_division_by_zero(lobe, dtype):
 @dtypes
 @lobes
 @pytest.mark.parametrize("kind", ["fibonacci", "cosine", "lobe", "mis"])
-def test_samplers(kind, lobe, dtype):
+def test_sampled_directions_and_their_estimate_are_bounded(kind, lobe, dtype):
     torch.manual_seed(0)
     leaf, material, wo, _ = hard_scene(dtype)
-    samples = sample_directions(kind, leaf["n"], wo, material.roughness, 64, LOBES[lobe], stochastic=True)
+    samples = sample_directions(
+        Sampling(kind, 64, LOBES[lobe], stochastic=True), leaf["n"], wo, material.roughness
+    )
     assert samples.pdf.isfinite().all()
     assert samples.pdf.ge(0).all()
     assert (samples.wi.norm(dim=-1) - 1).abs().max() < (0.02 if dtype == torch.bfloat16 else 1e-5)
@@ -123,7 +133,7 @@ def test_importance_samples_of_a_mirror_cause_no_fireflies(kind, lobe):
     r = torch.tensor([[1e-4], [0.05], [0.1]])
     n, wo = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3), torch.tensor([[0.6, 0.0, 0.8]]).expand(3, 3)
     material = Material(torch.ones(3, 3), r, torch.ones(3, 1))
-    samples = sample_directions(kind, n, wo, r, 4096, LOBES[lobe], stochastic=True)
+    samples = sample_directions(Sampling(kind, 4096, LOBES[lobe], stochastic=True), n, wo, r)
     single = IncidentSamples(samples.wi.reshape(-1, 1, 3), samples.pdf.reshape(-1, 1))
     many = Material(*(t.repeat_interleave(4096, 0) for t in (material.base_color, r, material.metallic)))
     light = torch.ones_like(single.wi)

@@ -33,7 +33,7 @@ def repaint(root: Path, look: Look) -> Path:
     capture = load_capture(root)
     radius = RADIUS / SCALE
     for view in capture.views:
-        rays = camera_rays(capture.normalisation.camera(view.camera))
+        rays = camera_rays(capture.scene_camera(view))
         o, d = rays.origins.double().numpy(), rays.directions.double().numpy()
         # |o + t d|² = r²
         b = (o * d).sum(-1)

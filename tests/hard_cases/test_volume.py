@@ -19,7 +19,7 @@ CONFIG = VolumeConfig(initial_samples=16, samples=8)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("beta", [1e-4, 1.0])
 @pytest.mark.parametrize("sdf", [-1e6, -1.0, -1e-30, 0.0, 1e-30, 1.0, 1e6])
-def test_density(sdf, beta, dtype):
+def test_density_and_its_slopes_are_bounded(sdf, beta, dtype):
     sdf = torch.tensor(sdf, dtype=dtype, requires_grad=True)
     beta = torch.tensor(beta, dtype=dtype, requires_grad=True)
     density = laplace_density(sdf, beta)
@@ -31,7 +31,7 @@ def test_density(sdf, beta, dtype):
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-30, 1.0, 1e8])
 @pytest.mark.parametrize("span", [0.0, 1e-30, 1.0, 1e4])
-def test_weights(sigma, span):
+def test_weights_and_transmittance_add_up_to_one(sigma, span):
     density = torch.full((2, 4), sigma, requires_grad=True)
     distances = torch.tensor([[0.0, 0.0, 0.5, 0.5], [0.0, 0.25, 0.5, 1.0]]) * span
     found = render_weights(density, distances, torch.full((2,), span))
@@ -48,7 +48,7 @@ def test_weights(sigma, span):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 @pytest.mark.parametrize("stochastic", [False, True])
 @pytest.mark.parametrize("beta", [1e-4, 0.01, 10.0])
-def test_sampler(beta, stochastic, dtype):
+def test_samples_are_ordered_and_within_their_interval(beta, stochastic, dtype):
     """Rays through the centre, grazing rays, rays that miss the scene, rays of length 0, and rays that start
     on the surface.
     """

@@ -14,6 +14,7 @@ from neilfpp_method.health.watch import Watch
 from neilfpp_method.schedule import STAGES, Stage
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import PixelBatch, SurfaceHits
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.json_files import write_json
 from tests.data.make_capture import make_capture
@@ -109,4 +110,4 @@ def test_a_strict_command_ends_with_status_1_and_keeps_the_run(tmp_path, monkeyp
     said = capfd.readouterr()
     assert "fog" in said.err
     assert json.loads((out / "health.json").read_text())["verdict"] == "failed"
-    assert (out / "checkpoints" / "last.pt").is_file()
+    assert last_checkpoint(out).is_file()

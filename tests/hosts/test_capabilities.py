@@ -12,7 +12,7 @@ from neilfpp_method.hosts import base
 from neilfpp_method.hosts.capabilities import CAPABILITIES, Capability, markdown
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "hosts.md"
-REQUIRED = {"Host", "ImageHost", "RegularisedHits"}
+REQUIRED = {"Host", "ImageHost", "RegularizedHits"}
 
 
 def test_every_optional_part_of_the_contract_is_in_the_table_once():

@@ -85,10 +85,10 @@ def test_evaluation_with_gradients_samples_whole_rays():
 def test_training_skips_empty_space_and_ages_the_grid():
     skipping = host().train()
     for _ in range(3):
-        skipping.render_regularised(sphere_batch(), ())
+        skipping.render_regularized(sphere_batch(), ())
     assert skipping.empty_space.age == 3
     with torch.no_grad():
-        skipping.render_regularised(sphere_batch(), ())
+        skipping.render_regularized(sphere_batch(), ())
     assert skipping.empty_space.age == 3  # the geometry was not trained
 
 
@@ -132,7 +132,7 @@ def test_no_ray_to_render_is_no_error():
 
 def test_a_checkpoint_continues_with_the_same_grid():
     first = host().train()
-    first.render_regularised(sphere_batch(), ())
+    first.render_regularized(sphere_batch(), ())
     second = host().train()
     with torch.no_grad():
         for parameter in second.parameters():

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neilfpp_method.fields.sdf import SdfSample
-from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularised
+from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularized
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
@@ -39,7 +39,7 @@ def sharp() -> VolSdfHost:
 
 def test_the_host_keeps_the_contracts(sharp):
     assert isinstance(sharp, Host)
-    assert isinstance(sharp, Regularised)
+    assert isinstance(sharp, Regularized)
     assert isinstance(sharp, HasSurfaceWidth)
     assert isinstance(sharp, HasParameterGroups)
 
@@ -123,8 +123,8 @@ def test_the_opacity_of_rays_that_graze_a_sphere_is_accurate(name, beta, error, 
 
 def test_only_the_named_losses_are_computed(sharp):
     batch = sphere_batch(8)
-    assert set(sharp.render_regularised(batch, ["eikonal", "surface"]).terms) == {"eikonal", "surface"}
-    assert sharp.render_regularised(batch, []).terms == {}
+    assert set(sharp.render_regularized(batch, ["eikonal", "surface"]).terms) == {"eikonal", "surface"}
+    assert sharp.render_regularized(batch, []).terms == {}
 
 
 def test_regularizers_cover_the_whole_scene():
@@ -139,7 +139,7 @@ def test_regularizers_cover_the_whole_scene():
         asked.append(x) or SdfSample(x @ slope, slope.expand_as(x), torch.zeros(len(x), 4))
     )
     host.sdf_field.hessian = lambda x: asked.append(x) or torch.zeros(len(x), 3, 3)
-    terms = host.render_regularised(batch, ["eikonal", "surface", "hessian"]).terms
+    terms = host.render_regularized(batch, ["eikonal", "surface", "hessian"]).terms
     _, points, curved = asked
     assert points is curved
     assert points.shape == (3 * 16, 3)  # 8192 about the object and 4096 in the scene for 4096 rays
@@ -157,7 +157,7 @@ def test_a_mask_removes_a_solid_in_empty_space(background):
     batch = sphere_batch(32, spread=0.2)
     inside = 0.5 * batch.origins  # of the sphere that closes a scene without background
     empty = dataclasses.replace(batch, origins=inside, mask=torch.zeros(32), mask_known=torch.ones(32))
-    rendered = host.render_regularised(empty, ["mask"])
+    rendered = host.render_regularized(empty, ["mask"])
     assert rendered.hits.opacity.min() > 0.99
     rendered.terms["mask"].mean().backward()
     at, push = rendered.hits.position.detach(), torch.zeros(32)
@@ -176,7 +176,7 @@ def test_the_loss_of_a_point_cloud_is_its_distance():
     direction = normalize(torch.randn(64, 3), dim=-1)
     for radius, expected in ((RADIUS, 0.0), (RADIUS + 0.3, 0.3)):
         host = VolSdfHost(tiny_config(), FACTS, points=OrientedPoints(radius * direction, direction))
-        term = host.render_regularised(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
+        term = host.render_regularized(sphere_batch(8), ["point_cloud"]).terms["point_cloud"]
         assert term.mean().item() == pytest.approx(expected, abs=0.15)  # the field starts as a rough sphere
 
 

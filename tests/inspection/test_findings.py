@@ -176,23 +176,23 @@ def test_too_few_views_from_one_side(capture: Capture) -> None:
     assert {"few_views", "coverage"} <= kinds
 
 
-def test_scale(capture: Capture) -> None:
+def test_points_and_cameras_that_contradict_the_scene_box_are_found(capture: Capture) -> None:
     rng = np.random.default_rng(0)
     normal = rng.normal(size=(500, 3))
     for size, severity in ((2.0, "problem"), (0.05, "warning")):
-        points = np.array(capture.normalisation.center) + capture.normalisation.scale * size * rng.uniform(
+        points = np.array(capture.normalization.center) + capture.normalization.scale * size * rng.uniform(
             -1, 1, (500, 3)
         )
         write_ply(capture.root / "cloud.ply", points, normal)
         findings = inspect_capture(replace(capture, point_cloud=capture.root / "cloud.ply")).findings
         assert [(finding.kind, finding.severity) for finding in findings] == [("scale", severity)]
-    closer = replace(capture.normalisation, scale=10 * capture.normalisation.scale)
-    kinds = found(replace(capture, normalisation=closer, point_cloud=None))
+    closer = replace(capture.normalization, scale=10 * capture.normalization.scale)
+    kinds = found(replace(capture, normalization=closer, point_cloud=None))
     assert len(kinds["camera_inside"]) == len(capture.views)
     assert "scale_guessed" in found(replace(capture, scene_from="cameras"))
 
 
-def test_display_values(tmp_path: Path) -> None:
+def test_clipped_pixels_of_display_values_are_counted(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, views=20, size=(48, 36), hdr=False, masks=True))
     inspection = inspect_capture(capture)
     assert inspection.verdict.quality == "poor"  # the sphere of the tests is brighter than white
@@ -222,7 +222,7 @@ def test_the_command_prints_and_writes_the_findings(capture: Capture, tmp_path: 
     assert (picture == (200, 40, 40)).all(-1).any(), "the flagged view is red"
 
 
-def test_status(capture: Capture, tmp_path: Path, capfd) -> None:
+def test_with_strict_a_problem_gives_status_1(capture: Capture, tmp_path: Path, capfd) -> None:
     assert main(["inspect", str(capture.root), "--strict"]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"], "nothing is written without --out"
     change(capture.views[VICTIM].image, lambda pixels: 4 * pixels)

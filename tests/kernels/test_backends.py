@@ -94,7 +94,7 @@ def test_gradients_of_many_points_at_one_position_add_up():
     growth=st.integers(1, 600),
     seed=st.integers(0, 9),
 )
-def test_any_grid(levels, features, log2_entries, base, growth, seed):
+def test_every_grid_agrees_with_the_reference(levels, features, log2_entries, base, growth, seed):
     spec = grid_spec(levels, log2_entries, base * growth, base, features, BACKEND)
     x, generator = scattered(40, seed), torch.Generator().manual_seed(seed)
     rows = torch.randn(spec.entries, features, dtype=torch.float64, generator=generator)

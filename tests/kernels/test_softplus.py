@@ -71,7 +71,7 @@ def test_nan_stays_nan():
 
 
 @pytest.mark.parametrize("shape", [(0, 8), (1,), (3, 5, 7), ()])
-def test_any_shape(shape):
+def test_every_shape_is_kept(shape):
     z = torch.randn(shape)
     torch.testing.assert_close(softplus(z, 10.0).double(), exact(z, 10.0), rtol=1e-6, atol=1e-7)
     assert softplus(z, 10.0).shape == z.shape
@@ -96,6 +96,6 @@ def test_several_threads_compute_the_same():
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
-def test_other_types(dtype):
+def test_other_types_agree_to_their_precision(dtype):
     z = torch.randn(64).to(dtype)
     torch.testing.assert_close(softplus(z, 10.0).double(), exact(z, 10.0), rtol=1e-2, atol=1e-2)

@@ -9,12 +9,13 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.fit import Evidence, Light, fit_light
+from neilfpp_method.lighting.fit import Evidence, MapAndLamps, fit_light
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
-from neilfpp_method.lighting.transport import Transport, from_texels
+from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
-from neilfpp_method.shading.sampling import sample_directions
+from neilfpp_method.shading.sampling import Sampling, sample_directions
 from neilfpp_method.structures import Incident, Material, Observed
 from tests.lighting.surfaces import half_room, material, patches, points
 
@@ -22,17 +23,15 @@ from tests.lighting.surfaces import half_room, material, patches, points
 def fit(
     environment: EnvironmentLight,
     carried: Transport,
-    seen: Observed,
-    of: Material,
-    image: torch.Tensor,
+    target: Target,
     unit: float,
     steps: int,
     base_color_known: bool = False,
 ) -> None:
     """Set a map by a fit without lamps."""
-    start = Light(environment.log_radiance, torch.zeros(0, 3))
+    start = MapAndLamps(environment.log_radiance, torch.zeros(0, 3))
     objective = Objective("linear", unit, steps, base_color_known)
-    found = fit_light(start, carried, Target(seen.position, of, image), objective)
+    found = fit_light(start, carried, target, objective)
     environment.log_radiance.copy_(found.log_radiance)
 
 
@@ -55,7 +54,9 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     radiance = environment.log_radiance.exp().flatten(1).t()
     carried = sum(one.outgoing(of, radiance) for one in several) / len(several)
 
-    drawn = sample_directions("mis", seen.normal, seen.wo, of.roughness, 16_384, GGX, stochastic=True)
+    drawn = sample_directions(
+        Sampling("mis", 16_384, GGX, stochastic=True), seen.normal, seen.wo, of.roughness
+    )
     arriving = environment.radiance(seen.position, drawn.wi)
     arriving = torch.where(drawn.wi[..., 2:] < 0, 0.7, arriving)
     expected = shade(of, seen.normal, seen.wo, Incident.of(drawn, arriving), GGX).color
@@ -101,7 +102,7 @@ def test_a_lamp_is_found_with_its_position_and_brightness(tint, made_of, known, 
     carried = from_texels(found, seen, of.roughness, GGX, None)
     guess = Material(of.base_color * tint, of.roughness, of.metallic)
     for number in steps:
-        fit(found, carried, seen, guess, image, image.median().item(), number, known)
+        fit(found, carried, Target(seen.position, guess, image), image.median().item(), number, known)
 
     green = found.log_radiance[1]
     row, column = divmod(int(green.argmax()), 48)
@@ -125,7 +126,7 @@ def test_texels_without_observations_follow_their_neighbours():
     image = from_texels(true, seen, of.roughness, GGX, None).outgoing(of, torch.full((512, 3), 2.0))
     found = EnvironmentLight(16, 0.5)
     carried = from_texels(found, seen, of.roughness, GGX, None)
-    fit(found, carried, seen, of, image, 1.0, steps=300)
+    fit(found, carried, Target(seen.position, of, image), 1.0, steps=300)
     assert found.log_radiance[:, -2:].exp().mean().item() == pytest.approx(2.0, rel=0.35)
 
 
@@ -145,7 +146,7 @@ def test_texels_that_few_points_see_do_not_become_a_sun():
     carried = from_texels(found, seen, of.roughness, GGX, None)
     image = carried.outgoing(of, torch.full((2048, 3), 2.0))
     image[:12] *= 5
-    fit(found, carried, seen, of, image, 1.0, steps=100)
+    fit(found, carried, Target(seen.position, of, image), 1.0, steps=100)
     assert found.log_radiance.exp().max() < 4.0
 
 
@@ -193,5 +194,5 @@ def test_a_map_without_a_finite_solution_is_unchanged():
     before = environment.log_radiance.clone()
     carried = from_texels(environment, seen, of.roughness, GGX, None)
     broken = torch.full((8, 3), math.inf)
-    fit(environment, carried, seen, of, broken, 1.0, steps=3)
+    fit(environment, carried, Target(seen.position, of, broken), 1.0, steps=3)
     assert torch.equal(environment.log_radiance, before)

@@ -9,7 +9,7 @@ import torch
 
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence
-from neilfpp_method.lighting.transport import from_texels
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, points

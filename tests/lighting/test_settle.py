@@ -13,9 +13,11 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
-from neilfpp_method.lighting.objective import Objective, Target
+from neilfpp_method.lighting.fit_points import FitPoints
+from neilfpp_method.lighting.lamp_transport import from_lamps, in_sight, lamp_kernel
+from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.settle import settle_lamps
-from neilfpp_method.lighting.transport import Transport, from_lamps, in_sight, lamp_kernel
+from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import half_room, material, patches, points
@@ -46,9 +48,7 @@ def photographed(lamps: FoundLamps, speckled: bool) -> tuple[Observed, Material,
 def settled(start: FoundLamps, true: FoundLamps, base_color_known: bool) -> FoundLamps:
     seen, of, beside = photographed(true, speckled=base_color_known)
     objective = Objective("linear", seen.pixel.median().item(), STEPS, base_color_known)
-    return settle_lamps(
-        start, RADIUS, beside, seen, Target(seen.position, of, seen.pixel), GGX, None, objective
-    )
+    return settle_lamps(start, RADIUS, beside, FitPoints(seen, of, GGX, None), objective)
 
 
 def test_derivatives_by_place_and_axis():
@@ -146,9 +146,8 @@ def test_base_colours_learned_under_a_misplaced_lamp_do_not_keep_it_there(base_c
     torch.testing.assert_close(under_astray.outgoing(learned, astray.intensity), pixel)
 
     objective = Objective("linear", pixel.median().item(), STEPS, base_color_known)
-    found = settle_lamps(
-        astray, RADIUS, even, seen, Target(seen.position, learned, pixel), None, None, objective
-    )
+    seen = dataclasses.replace(seen, pixel=pixel)
+    found = settle_lamps(astray, RADIUS, even, FitPoints(seen, learned, None, None), objective)
     off = (found.places.position - true.places.position).norm(dim=-1).min()
     assert off < within
     assert not base_color_known or off > 0.15
@@ -164,7 +163,7 @@ def test_without_information_lamps_are_unchanged(broken):
         start = FoundLamps(TRUE.places[:0], TRUE.intensity[:0])
     else:
         seen.pixel[0] = torch.nan
-    target, objective = Target(seen.position, of, seen.pixel), Objective("linear", 0.3, STEPS)
-    found = settle_lamps(start, RADIUS, beside, seen, target, GGX, None, objective)
+    objective = Objective("linear", 0.3, STEPS)
+    found = settle_lamps(start, RADIUS, beside, FitPoints(seen, of, GGX, None), objective)
     torch.testing.assert_close(found.places.position, start.places.position)
     torch.testing.assert_close(found.intensity, start.intensity)

@@ -11,10 +11,10 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.fit import Light, fit_light
+from neilfpp_method.lighting.fit import MapAndLamps, fit_light
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.sky import HALF_WEIGHT_SPREAD, SkySightings
-from neilfpp_method.lighting.transport import from_texels
 from neilfpp_method.shading.color import linear_to_srgb
 from tests.lighting.surfaces import material, points
 
@@ -94,7 +94,7 @@ def test_a_fit_keeps_observed_texels_and_estimates_the_others():
     def error(known: SkySightings | None) -> torch.Tensor:
         unit = image.median().item()
         objective = Objective("linear", unit, steps=300, sky=known and known.known())
-        start = Light(torch.full((3, HEIGHT, 2 * HEIGHT), math.log(0.5)), torch.zeros(0, 3))
+        start = MapAndLamps(torch.full((3, HEIGHT, 2 * HEIGHT), math.log(0.5)), torch.zeros(0, 3))
         found = fit_light(start, carried, Target(seen.position, wrong, image), objective)
         return (found.log_radiance - truth.log()).abs().mean(0)
 

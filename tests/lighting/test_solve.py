@@ -14,9 +14,11 @@ from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.candidates import merge, propose
 from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.fit_points import FitPoints
+from neilfpp_method.lighting.lamp_transport import from_lamps
+from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.lighting.solve import solve_light
-from neilfpp_method.lighting.transport import from_lamps, from_texels
 from neilfpp_method.settings.types import LightFitConfig, MapLightConfig
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material, Observed
@@ -58,26 +60,24 @@ def photographed(lamp: LampPlaces | None, speckled: bool = False) -> tuple[Obser
 
 
 def solve(
-    environment: EnvironmentLight,
-    lamps: Lamps,
+    light: LightModel,
     seen: Observed,
     of: Material,
-    unit: float,
     config: MapLightConfig,
     first: bool,
     base_color_known: bool = False,
 ) -> Evidence | None:
-    objective = Objective("linear", unit, config.fit.steps, base_color_known)
-    return solve_light(LightModel(environment, lamps), seen, of, GGX, None, objective, config, first)
+    """Solve for the light of open points of known roughness, in units of their median pixel."""
+    objective = Objective("linear", seen.pixel.median().item(), config.fit.steps, base_color_known)
+    return solve_light(light, FitPoints(seen, of, GGX, None), objective, config, first)
 
 
 def solved(seen: Observed, of: Material, rounds: int, base_color_known: bool = False) -> tuple[Lamps, object]:
     torch.manual_seed(0)
-    environment, lamps = EnvironmentLight(12, 0.7), Lamps(4, 0.06)
+    light = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06))
     for number in range(rounds):
-        unit = seen.pixel.median().item()
-        evidence = solve(environment, lamps, seen, of, unit, CONFIG, number == 0, base_color_known)
-    return lamps, evidence
+        evidence = solve(light, seen, of, CONFIG, number == 0, base_color_known)
+    return light.lamps, evidence
 
 
 @pytest.mark.parametrize("true", [BULB, PANEL], ids=["bulb", "panel"])
@@ -148,8 +148,7 @@ def test_lamps_are_found_under_a_known_map_which_is_unchanged():
     before = environment.log_radiance.clone()
     torch.manual_seed(0)
     for _ in range(3):
-        unit = seen.pixel.median().item()
-        evidence = solve(environment, lamps, seen, of, unit, known, first=False)
+        evidence = solve(LightModel(environment, lamps), seen, of, known, first=False)
     assert torch.equal(environment.log_radiance, before)
     assert lamps.count
     assert 100 < evidence.points < 220  # a part of 800 points is some blocks
@@ -161,12 +160,11 @@ def test_lamps_are_found_under_a_known_map_which_is_unchanged():
 
 def test_under_only_a_known_sky_no_lamp_is_lit():
     seen, of = photographed(None)
-    environment, lamps = EnvironmentLight(12, 0.5), Lamps(4, 0.06)
+    light = LightModel(EnvironmentLight(12, 0.5), Lamps(4, 0.06))
     torch.manual_seed(0)
-    known = dataclasses.replace(CONFIG, map="sky.exr")
-    evidence = solve(environment, lamps, seen, of, seen.pixel.median().item(), known, first=True)
+    evidence = solve(light, seen, of, dataclasses.replace(CONFIG, map="sky.exr"), first=True)
     assert evidence.points == 800  # in the first decision each point is held back once
-    assert lamps.count == 0
+    assert light.lamps.count == 0
 
 
 @pytest.mark.parametrize("count", [1, 3, 5])
@@ -190,7 +188,8 @@ def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(m
         torch.manual_seed(0)
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
         objective = Objective("linear", unit, CONFIG.fit.steps)
-        solve_light(light, seen, of, GGX, None, objective, CONFIG, first=False, lamps_if_undecided=doubt)
+        points = FitPoints(seen, of, GGX, None)
+        solve_light(light, points, objective, CONFIG, first=False, lamps_if_undecided=doubt)
         lit.append(light.lamps.count)
     assert lit[0] == 0
     assert lit[1] > 0

@@ -244,7 +244,7 @@ def test_a_capture_with_poses_keeps_them(tmp_path):
     assert prepare(tmp_path / "sphere", tmp_path / "out") == 0
     capture = load_capture(tmp_path / "out")
     assert capture.format == "neilfpp"
-    assert capture.normalisation == source.normalisation
+    assert capture.normalization == source.normalization
     assert capture.test == source.test
     for view, old in zip(capture.views, source.views, strict=True):
         assert view.name == old.name
@@ -297,7 +297,7 @@ def test_too_few_images(own, tmp_path, capfd, kept, says):
     assert not (tmp_path / "out").exists()
 
 
-def test_no_features(tmp_path, capfd):
+def test_photographs_without_features_are_refused(tmp_path, capfd):
     for i in range(4):
         write_exr(tmp_path / "photos" / f"{i}.exr", {"RGB": np.full((120, 160, 3), 0.5, np.float32)})
     refused(capfd, tmp_path / "photos", tmp_path / "out", says="have features")
@@ -389,7 +389,7 @@ def test_the_ring_is_placed_exactly(tmp_path):
     poses = {name: np.array(camera["w2c"]) for name, camera in truth.items()}
     scale, _, _, centers, rotations = to_truth(capture, poses)
     assert len(capture.views) == 36
-    assert centers < 0.005 * scale * capture.normalisation.scale
+    assert centers < 0.005 * scale * capture.normalization.scale
     assert rotations < 0.2
     assert (
         main(

@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from neilfpp_method.data.views import Camera, Normalisation
+from neilfpp_method.data.views import Camera, Normalization
 from neilfpp_method.prepare.depth_fusion import fuse
 from neilfpp_method.prepare.depth_planes import fit_planes
 from neilfpp_method.prepare.plane_sweep import GrayView, choose_sources, inverse_depth_step, sweep
 from tests.prepare.textured_corner import FOCAL, photograph, pose
 
 SIZE = (240, 180)
-BOX = Normalisation(0.8, (0.4, 0.4, 0.4))
+BOX = Normalization(0.8, (0.4, 0.4, 0.4))
 
 
 def camera(w2c: np.ndarray, size: tuple[int, int] = SIZE) -> Camera:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.point_cloud import WorldPoints
-from neilfpp_method.data.views import Camera, Normalisation, View
+from neilfpp_method.data.views import Camera, Normalization, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.mapping import refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing
@@ -66,7 +66,7 @@ def test_the_images_show_cameras_points_and_failures(tmp_path):
     ]
     up = np.tile([0.0, 0.0, 1.0], (500, 1))
     points = WorldPoints(np.random.default_rng(0).random((500, 3)), up)
-    box = Normalisation(0.8, (0.5, 0.5, 0.5))
+    box = Normalization(0.8, (0.5, 0.5, 0.5))
     scene = draw_scene(views, {"4"}, points, box)
     assert has(scene, TRAIN)
     assert has(scene, TEST)

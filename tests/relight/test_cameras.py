@@ -76,7 +76,7 @@ def test_a_turntable_is_a_circle_around_the_center(capture):
     shots = turntable(capture, 8, None, None)
     assert [shot.name for shot in shots][:2] == ["turn_0000", "turn_0001"]
     eyes = np.stack([shot.camera.c2w[:, 3] for shot in shots])
-    distances = [np.linalg.norm(capture.normalisation.camera(v.camera).c2w[:, 3]) for v in capture.views]
+    distances = [np.linalg.norm(capture.scene_camera(v).c2w[:, 3]) for v in capture.views]
     np.testing.assert_allclose(np.linalg.norm(eyes, axis=1), np.median(distances))
     azimuth = np.unwrap(np.arctan2(eyes[:, 1], eyes[:, 0]))
     np.testing.assert_allclose(np.diff(azimuth), 2 * np.pi / 8)

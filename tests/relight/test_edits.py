@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.edits import parse_edits, scene_box, with_edits
 from neilfpp_method.structures import Material
@@ -29,7 +29,7 @@ def test_edits_replace_what_they_name():
 
 def test_a_box_of_the_world_bounds_an_edit():
     # The world is twice as large as the scene, with its centre at (1, 0, 0).
-    box = scene_box((3.0, 2.0, 2.0, 1.0, -2.0, -2.0), Normalisation(2.0, (1.0, 0.0, 0.0)))
+    box = scene_box((3.0, 2.0, 2.0, 1.0, -2.0, -2.0), Normalization(2.0, (1.0, 0.0, 0.0)))
     x = torch.tensor([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0], [0.5, 0.0, 1.1], [1.0, 1.0, -1.0]])
     changed = with_edits(gray, parse_edits(["metallic=1"]), [box.contains])(x).metallic[:, 0]
     assert changed.numpy() == pytest.approx([1.0, 0.1, 0.1, 1.0])
@@ -56,4 +56,4 @@ def test_invalid_edits_are_refused(text):
 @pytest.mark.parametrize("corners", [(0.0, 0.0, 0.0, 1.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0, 1.0, float("nan"))])
 def test_a_box_without_an_inside_is_refused(corners):
     with pytest.raises(UserError, match="--box"):
-        scene_box(corners, Normalisation(1.0, (0.0, 0.0, 0.0)))
+        scene_box(corners, Normalization(1.0, (0.0, 0.0, 0.0)))

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.lamp_edits import edited_lamps, parse_lamp_edits
 from neilfpp_method.relight.lamplight import Lamplight
 
-FRAME = Normalisation(2.0, (1.0, 0.0, 0.0))
+FRAME = Normalization(2.0, (1.0, 0.0, 0.0))
 
 
 def three_lamps() -> Lamplight:

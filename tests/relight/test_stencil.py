@@ -40,7 +40,7 @@ def mask(folder: Path, name: str, pixels: np.ndarray) -> Path:
 
 def seen_points(capture: Capture, name: str) -> tuple[torch.Tensor, torch.Tensor]:
     """Hits of the rays of a view on the ball, (N, 3), and the indices of their pixels, (N,)."""
-    camera = capture.normalisation.camera(next(view.camera for view in capture.views if view.name == name))
+    camera = capture.normalization.camera(next(view.camera for view in capture.views if view.name == name))
     rays = camera_rays(camera)
     position, hit = meet_ball(rays, IN_SCENE)
     rows = torch.nonzero(hit)[:, 0]

@@ -23,6 +23,7 @@ from neilfpp_method.report.markup import Html, data_block, element
 from neilfpp_method.report.write import ReportOptions, write_report
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import fixed_geometry, preset
+from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint
 from tests.calls import train_tiny
 from tests.data.make_capture import make_capture
 
@@ -223,13 +224,13 @@ def test_a_damaged_side_file_is_named_and_left_out(run: Path):
 
 
 def test_the_page_of_a_stopped_run_says_how_to_continue(run: Path):
-    (run / "checkpoints" / "last.pt").write_bytes((run / "checkpoints" / "sdf_init.pt").read_bytes())
+    last_checkpoint(run).write_bytes(checkpoint_path(run, "sdf_init").read_bytes())
     page = page_of(run)
     assert "stopped after step 4 of 12" in page.text
     assert "--resume" in page.text
     assert "only the geometry is shown" in page.text
     assert "color" not in page.data["surface-data"]
-    shutil.rmtree(run / "checkpoints")
+    shutil.rmtree(last_checkpoint(run).parent)
     page = page_of(run)
     assert "stopped before its first checkpoint" in page.text
     assert page.data == {}

@@ -4,12 +4,14 @@ line.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from collections.abc import Iterator
+from typing import get_args, get_type_hints
 
 import pytest
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.count import leaves
 from neilfpp_method.settings.plain import changed, from_dict, to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import (
@@ -25,6 +27,17 @@ EVERY = (
     + [fixed_geometry(preset(name)) for name in PRESETS]
     + [free_light(preset("fast"))]
 )
+
+
+def leaves(kind: type, where: str = "") -> Iterator[str]:
+    """The dotted name of every setting once; for a part with several kinds, those of all its kinds."""
+    for name, hint in get_type_hints(kind).items():
+        parts = [part for part in (hint, *get_args(hint)) if dataclasses.is_dataclass(part)]
+        if parts:
+            # A dictionary removes duplicates and keeps the order.
+            yield from {leaf: None for part in parts for leaf in leaves(part, f"{where}{name}.")}
+        else:
+            yield f"{where}{name}"
 
 
 def test_there_are_not_too_many_settings():

@@ -31,12 +31,12 @@ def test_round_trip_inside_and_outside_the_unit_interval():
 
 
 @pytest.mark.parametrize("curve", [linear_to_srgb, srgb_to_linear])
-def test_gradcheck(curve):
+def test_derivatives_of_the_curves_agree_with_differences(curve):
     color = torch.tensor([-1.0, 0.0, 1e-3, 0.1, 1.0, 5.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(curve, color)
 
 
-def test_responses():
+def test_a_response_is_the_identity_or_the_clipped_srgb_curve():
     color = torch.tensor([-1.0, 0.0, 0.25, 1.0, 7.0])
     assert torch.equal(apply_response(color, "linear"), color)
     # 1.055 · 0.25^(1/2.4) − 0.055 = 0.53710
@@ -49,7 +49,7 @@ def test_an_undetermined_response_is_refused():
         apply_response(torch.zeros(3), "auto")
 
 
-def test_luminance():
+def test_luminance_has_the_weights_of_rec_709():
     assert luminance(torch.eye(3)).allclose(torch.tensor([0.2126, 0.7152, 0.0722]))
     assert luminance(torch.ones(2, 3)).allclose(torch.ones(2))
 

@@ -10,7 +10,14 @@ import torch
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading import sampling
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
-from neilfpp_method.shading.sampling import Technique, combine, fibonacci, sample_directions, sphere_lattice
+from neilfpp_method.shading.sampling import (
+    Sampling,
+    Technique,
+    combine,
+    fibonacci,
+    sample_directions,
+    sphere_lattice,
+)
 from tests import oracles
 
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
@@ -46,7 +53,9 @@ def test_chi2(kind, lobe, r, view):
     one = tuple(t[:1] for t in many)
     result = oracles.chi2_test(
         lambda: (
-            sample_directions(kind, *many, PER_POINT, LOBES[lobe], stochastic=True).wi.reshape(-1, 3).numpy()
+            sample_directions(Sampling(kind, PER_POINT, LOBES[lobe], stochastic=True), *many)
+            .wi.reshape(-1, 3)
+            .numpy()
         ),
         lambda wi: density(kind, LOBES[lobe], torch.from_numpy(wi)[None], *one)[0].numpy(),
         tests=len(CASES) * len(NORMALS),
@@ -59,22 +68,22 @@ def test_chi2(kind, lobe, r, view):
 def test_the_reported_pdf_is_the_density_at_the_directions(kind):
     torch.manual_seed(4)
     n, wo, r = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 5)
-    samples = sample_directions(kind, n, wo, r, 16, GGX, stochastic=True)
+    samples = sample_directions(Sampling(kind, 16, GGX, stochastic=True), n, wo, r)
     assert torch.equal(samples.pdf, density(kind, GGX, samples.wi, n, wo, r))
     assert samples.wi.norm(dim=-1).allclose(torch.ones(5, 16, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_determinism(kind):
+def test_only_stochastic_directions_depend_on_the_seed(kind):
     scene = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 2)
-    still = [sample_directions(kind, *scene, 8, GGX, stochastic=False).wi for _ in range(2)]
+    still = [sample_directions(Sampling(kind, 8, GGX, stochastic=False), *scene).wi for _ in range(2)]
     assert torch.equal(*still)
-    moving = sample_directions(kind, *scene, 8, GGX, stochastic=True).wi
+    moving = sample_directions(Sampling(kind, 8, GGX, stochastic=True), *scene).wi
     assert not torch.equal(moving[0], moving[1])
     torch.manual_seed(5)
-    first = sample_directions(kind, *scene, 8, GGX, stochastic=True).wi
+    first = sample_directions(Sampling(kind, 8, GGX, stochastic=True), *scene).wi
     torch.manual_seed(5)
-    assert torch.equal(first, sample_directions(kind, *scene, 8, GGX, stochastic=True).wi)
+    assert torch.equal(first, sample_directions(Sampling(kind, 8, GGX, stochastic=True), *scene).wi)
 
 
 def test_fibonacci_lies_at_cell_midpoints():
@@ -91,7 +100,7 @@ def test_mis_is_unbiased_for_odd_counts(count):
     """The mean of (n·wi)/pdf estimates ∫ n·wi dwi = π; with one sample the mixture has only the cosine."""
     torch.manual_seed(6)
     n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
-    samples = sample_directions("mis", n, wo, r, count, SPHERICAL_GAUSSIAN, stochastic=True)
+    samples = sample_directions(Sampling("mis", count, SPHERICAL_GAUSSIAN, stochastic=True), n, wo, r)
     assert samples.pdf.shape == (20_000, count)
     estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
     assert estimate == pytest.approx(math.pi, rel=5e-3)
@@ -99,14 +108,14 @@ def test_mis_is_unbiased_for_odd_counts(count):
 
 def test_samples_carry_no_gradient():
     n, wo, r = (t.clone().requires_grad_() for t in points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 2))
-    samples = sample_directions("mis", n, wo, r, 8, GGX, stochastic=True)
+    samples = sample_directions(Sampling("mis", 8, GGX, stochastic=True), n, wo, r)
     assert not samples.wi.requires_grad
     assert not samples.pdf.requires_grad
 
 
 def test_an_unknown_sampler_is_refused():
     with pytest.raises(UserError, match="choose fibonacci, cosine, lobe, mis or no_lobe"):
-        sample_directions("uniform", *points((0, 0, 1.0), (0, 0, 1.0), 1), 4, GGX, False)
+        sample_directions(Sampling("uniform", 4, GGX, stochastic=False), *points((0, 0, 1.0), (0, 0, 1.0), 1))
 
 
 # ---------------------------------------------------------------------------------------- light that is known
@@ -133,7 +142,7 @@ def light_of(n):
 def test_mis_with_light_estimates_the_same_integral(count):
     torch.manual_seed(7)
     n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 100_000)
-    samples = sample_directions("mis", n, wo, r, count, GGX, stochastic=True, light=light_of(n))
+    samples = sample_directions(Sampling("mis", count, GGX, stochastic=True), n, wo, r, light_of(n))
     assert samples.pdf.shape == (100_000, count)
     estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
     assert estimate == pytest.approx(math.pi, rel=2e-2)
@@ -149,7 +158,12 @@ def test_the_density_of_mis_with_light_is_that_of_its_directions():
         return (0.75 * light.pdf(wi) + 0.25 * density("lobe", GGX, wi, *one))[0].numpy()
 
     result = oracles.chi2_test(
-        lambda: sample_directions("mis", n, wo, r, 8, GGX, True, light).wi.reshape(-1, 3).numpy(), pdf
+        lambda: (
+            sample_directions(Sampling("mis", 8, GGX, stochastic=True), n, wo, r, light)
+            .wi.reshape(-1, 3)
+            .numpy()
+        ),
+        pdf,
     )
     assert result.passed, result
     assert result.total == pytest.approx(1, abs=1e-4)

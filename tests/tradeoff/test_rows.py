@@ -13,8 +13,7 @@ from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings import presets
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.tradeoff import rows
-from neilfpp_method.tradeoff.rows import rows_of
+from neilfpp_method.tradeoff.rows import TradeoffRequest, rows_of
 from neilfpp_method.train.budget_record import read_budget
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config
@@ -110,8 +109,8 @@ def test_bad_input_is_one_line(tmp_path, words, options, complaint, capsys):
 
 
 def test_seeds_start_at_that_of_the_settings(tmp_path):
-    found = rows_of(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu")
+    found = rows_of(TradeoffRequest(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu"))
     assert [row.name for row in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
     assert [row.config.train.seed for row in found] == [3, 4, 3, 4]
     with pytest.raises(UserError, match="contains a budget twice"):
-        rows.rows_of(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu")
+        rows_of(TradeoffRequest(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu"))

@@ -76,12 +76,22 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
     pixels = PixelDataset(capture, capture.train_views)
     seed_step(config.train.seed, step=-1)
     model = build_model(capture, scene_facts(capture, pixels, config), config)
-    fabric, listener = Fabric(accelerator="cpu", devices=1), Listener()
-    solver, watch = model.light_solver(), Watch(pixels.sample(64), listener.warn)
-    plan = Plan.begin(EffectRequest("as-set"), config)
-    quiet = (lambda: False, lambda model, stage: None, "")
-    quality = Quality(hold_back(pixels, config.train.seed, patches), capture.hdr)
-    return Training(out, config, model, pixels, fabric, listener, *quiet, solver, watch, plan, quality)
+    listener = Listener()
+    return Training(
+        path=out,
+        config=config,
+        model=model,
+        pixels=pixels,
+        fabric=Fabric(accelerator="cpu", devices=1),
+        reporter=listener,
+        should_stop=lambda: False,
+        preview=lambda model, stage: None,
+        continue_with="",
+        light_solver=model.light_solver(),
+        watch=Watch(pixels.sample(64), listener.warn),
+        plan=Plan.begin(EffectRequest("as-set"), config),
+        quality=Quality(hold_back(pixels, config.train.seed, patches), capture.hdr),
+    )
 
 
 def differences(one: object, other: object, where: str = "") -> list[str]:

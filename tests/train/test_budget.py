@@ -25,9 +25,10 @@ from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train import budgeted, command
 from neilfpp_method.train.budget_record import BudgetPlan, read_budget
 from neilfpp_method.train.budgeted import planned_effects
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import load_checkpoint, load_run
+from neilfpp_method.train.run import load_run
 from neilfpp_method.train.trial import Trial, TrialLimits, Workload, run_trial
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light
@@ -66,7 +67,7 @@ def workload(capture: Capture, config: NeilfConfig, base: str, report: bool = Fa
 
 
 def trained_steps(out: Path) -> int:
-    return load_checkpoint(out / "checkpoints" / "last.pt")["step"]
+    return load_checkpoint(last_checkpoint(out))["step"]
 
 
 def test_a_run_keeps_its_budget_although_steps_are_slower_than_in_the_trial(tmp_path, capture, clock):
@@ -181,13 +182,13 @@ def test_without_time_for_the_initial_light_training_starts_from_an_even_one(tmp
     capture = make_capture(tmp_path / "many", views=9)
     training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
     plan = Plan.begin(parse_effects("auto"), training.config)
-    decisions, light = review_light(plan, training.model, training.pixels, 0, most=0)
-    assert light is None
-    assert {(decision.effect, decision.on) for decision in decisions} == {
+    review = review_light(plan, training.model, training.pixels, 0, most=0)
+    assert review.first is None
+    assert {(decision.effect, decision.on) for decision in review.decisions} == {
         ("long-tails", True),
         ("metals", True),
     }
-    assert all("the budget leaves no time for it" in decision.reason for decision in decisions)
+    assert all("the budget leaves no time for it" in decision.reason for decision in review.decisions)
     planned = BudgetPlan(60.0, "usual", Costs({}), places_looked_at=True, light_pixels=0)
     planned_effects(planned, plan)
     assert "20% of the budget" in plan.newest("long-tails").reason

@@ -18,16 +18,8 @@ import torch
 from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.train.run import (
-    FORMAT,
-    CaptureSource,
-    check_free,
-    create_run,
-    load_checkpoint,
-    load_run,
-    read_description,
-    save_checkpoint,
-)
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
+from neilfpp_method.train.run import FORMAT, CaptureSource, check_free, create_run, load_run, read_description
 from tests.scenes import tiny_config
 
 FACTS = SceneFacts("linear", 0.25, 3.0, "constant", (0.5, 0.25, 0.125))
@@ -55,8 +47,8 @@ def refused(path: Path, complaint: str) -> None:
 
 def test_a_checkpoint_is_read_back(tmp_path):
     model, solver, optimizer = learner()
-    save_checkpoint(tmp_path / "checkpoints" / "last.pt", model, solver, optimizer, 7)
-    saved = load_checkpoint(tmp_path / "checkpoints" / "last.pt")
+    save_checkpoint(last_checkpoint(tmp_path), model, solver, optimizer, 7)
+    saved = load_checkpoint(last_checkpoint(tmp_path))
     assert saved["step"] == 7
     torch.testing.assert_close(saved["model"], model.state_dict(), rtol=0, atol=0)
     other_model, _, other = learner()

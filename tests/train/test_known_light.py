@@ -16,6 +16,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import FreeLightConfig, LightFitConfig, MapLightConfig, NeilfConfig
+from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint
 from neilfpp_method.train.light_record import LightFit, light_summary, read_fits, write_fits
 from neilfpp_method.train.run import load_run
 from tests.calls import refused, train_tiny
@@ -94,9 +95,9 @@ def test_a_stopped_run_continues_without_the_file(capture, sky, tmp_path):
     """With a checkpoint after every step; the first part of a run stands in for a stopped run."""
     out = train(capture, tmp_path / "run", "--light", sky)
     expected, record = radiance_of(out), read_fits(out, before=10**9)
-    stage = (out / "checkpoints" / "material_init.pt").read_bytes()
-    (out / "checkpoints" / "last.pt").write_bytes(stage)
-    (out / "checkpoints" / "joint.pt").unlink()
+    stage = checkpoint_path(out, "material_init").read_bytes()
+    last_checkpoint(out).write_bytes(stage)
+    checkpoint_path(out, "joint").unlink()
     sky.unlink()
     assert main(["train", "--out", str(out), "--resume", "--device", "cpu"]) == 0
     torch.testing.assert_close(radiance_of(out), expected, rtol=0, atol=0)

@@ -23,7 +23,7 @@ def fit(root: Path, factor: float, shift: float) -> MeshFit:
     """The fit of the true sphere, in the scene frame, after it was scaled and moved."""
     capture, config = load_capture(root), small_config()
     pixels = PixelDataset(capture, capture.train_views)
-    mesh = read_mesh(root / "inputs/model/mesh.ply", capture.normalisation)
+    mesh = read_mesh(root / "inputs/model/mesh.ply", capture.normalization)
     moved = Mesh(factor * mesh.vertices + torch.tensor([shift, 0, 0]), mesh.faces)
     return measure_mesh_fit(MeshHost(moved, config, scene_facts(capture, pixels, config)), pixels)
 

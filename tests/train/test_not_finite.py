@@ -17,6 +17,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import LossTerm
 from neilfpp_method.train import loop
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.training import Training
 from tests.train.small_runs import differences, small_config, small_training
@@ -141,10 +142,10 @@ def test_ten_in_a_row_end_the_training(tmp_path, capture, monkeypatch):
         Diverged, match="10 steps in a row were not finite, the last one in loss volume"
     ) as caught:
         train(training)
-    assert str(tmp_path / "checkpoints") in caught.value.remedy
+    assert str(last_checkpoint(tmp_path).parent) in caught.value.remedy
     assert training.skipped == 10
     # Steps 0 to 6 were finite; the checkpoint, made every third step, has the state after step 6.
-    saved = torch.load(tmp_path / "checkpoints" / "last.pt", weights_only=True)
+    saved = torch.load(last_checkpoint(tmp_path), weights_only=True)
     assert differences(saved["model"], states[6]["model"]) == []
     assert differences(saved["optimizer"]["state"], states[6]["optimizer"]) == []
 

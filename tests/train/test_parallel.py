@@ -18,6 +18,7 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.optimizer import seed_step
 from tests.train.small_runs import differences, small_config, small_training
 
@@ -71,7 +72,7 @@ def test_two_processes_end_with_one_model(tmp_path, capture):
 
     first, second = (recorded(tmp_path, f"parameters_{rank}") for rank in (0, 1))
     assert differences(first, second) == []
-    saved = torch.load(out / "checkpoints" / "last.pt", weights_only=True)
+    saved = torch.load(last_checkpoint(out), weights_only=True)
     assert saved["step"] == 6
     assert differences({name: saved["model"][name] for name in first}, first) == []
 
@@ -106,7 +107,7 @@ def test_a_stop_ends_both_processes_after_the_same_step(tmp_path, capture):
     """Only the first process receives the signal."""
     out = tmp_path / "run"
     with started(capture, out, "--config.train.sdf-steps", "100000") as process:
-        while not (out / "checkpoints" / "last.pt").exists():
+        while not last_checkpoint(out).exists():
             assert process.poll() is None
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
@@ -155,7 +156,7 @@ def test_two_nodes_end_with_one_model(tmp_path, capture):
     assert differences(first, second) == []
     seen = [recorded(tmp_path / f"node{rank}", "gradients_0") for rank in range(2)]
     assert differences(*seen) == []
-    assert torch.load(out / "checkpoints" / "last.pt", weights_only=True)["step"] == 6
+    assert torch.load(last_checkpoint(out), weights_only=True)["step"] == 6
 
 
 def free_port() -> int:

@@ -76,7 +76,7 @@ def test_the_psnr_is_that_of_clipped_srgb_values():
 
 
 def test_checks_are_rare_and_cheap(monkeypatch):
-    monkeypatch.setattr(quality, "_decibels", lambda *_: (20.0, None))
+    monkeypatch.setattr(quality, "_measure", lambda *_: quality._Measured(20.0, None))
     watch = Quality(sphere_batch(4), hdr=True)
     model = sphere_model()
     for number in range(1, 3001):

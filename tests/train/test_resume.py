@@ -24,6 +24,7 @@ from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import loop
+from neilfpp_method.train.checkpoint import LAST, checkpoint_path, last_checkpoint
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import load_run, read_description
@@ -56,8 +57,8 @@ def interrupt_at(patch: pytest.MonkeyPatch, *steps: int) -> None:
     patch.setattr(loop, "seed_step", seed_step)
 
 
-def state(out: Path, name: str = "last") -> dict:
-    return torch.load(out / "checkpoints" / f"{name}.pt", weights_only=True)
+def state(out: Path, name: str = LAST) -> dict:
+    return torch.load(checkpoint_path(out, name), weights_only=True)
 
 
 def files(folder: Path) -> dict[Path, tuple[int, bytes]]:
@@ -89,7 +90,7 @@ def test_a_stop_in_any_stage_changes_nothing(tmp_path, capture, whole, monkeypat
     assert state(out)["step"] == stops
     run(None, out, resume=True)
     assert state(out)["step"] == STEPS
-    for name in ("last", "sdf_init", "material_init", "joint"):
+    for name in (LAST, "sdf_init", "material_init", "joint"):
         assert differences(state(out, name), state(whole, name)) == []
     for stage in ("sdf_init", "material_init", "joint"):
         preview = Path("previews") / f"{stage}.png"
@@ -150,7 +151,7 @@ def test_a_run_on_a_full_disk_continues_when_there_is_space(tmp_path, capture, w
         ):
             run(capture, out, small_config())
     assert state(out)["step"] == 4
-    assert not [path for path in (out / "checkpoints").iterdir() if path.name.startswith(".")]
+    assert not [path for path in last_checkpoint(out).parent.iterdir() if path.name.startswith(".")]
     run(None, out, resume=True)
     assert differences(state(out), state(whole)) == []
 
@@ -252,7 +253,7 @@ def test_a_run_that_stopped_before_its_first_checkpoint_starts_again(tmp_path, c
     with monkeypatch.context() as patch:
         patch.setattr("neilfpp_method.train.command.train", lambda training: None)
         run(capture, out, small_config())
-    assert not (out / "checkpoints").exists()
+    assert not last_checkpoint(out).parent.exists()
     run(None, out, resume=True)
     assert differences(state(out), state(whole)) == []
 
@@ -289,7 +290,7 @@ def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
     ]
     command += ["--config.train.rays", str(rays), "--device", "cpu", "--out"]
     process = _start([*command, str(out)])
-    while not (out / "checkpoints" / "last.pt").exists():
+    while not last_checkpoint(out).exists():
         assert process.poll() is None
         time.sleep(0.005)
     process.send_signal(signal.SIGINT)

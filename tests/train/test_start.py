@@ -22,9 +22,9 @@ from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
 from neilfpp_method.train import command, start
 from neilfpp_method.train.build import build_model, scene_facts
+from neilfpp_method.train.checkpoint import last_checkpoint, save_checkpoint
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, waiting_fields
 from neilfpp_method.train.request import TrainingRequest
-from neilfpp_method.train.run import save_checkpoint
 from neilfpp_method.train.start import GeometryStart, start_geometry
 from tests.data.make_capture import RADIUS, SCALE, make_capture
 from tests.train.small_runs import small_config
@@ -154,7 +154,7 @@ def test_training_prints_its_start_and_a_resumed_run_does_not_start_again(masked
     """The loop is replaced: its initial state is saved as that after the first step."""
 
     def first_step(run: command.Training) -> None:
-        path = run.path / "checkpoints" / "last.pt"
+        path = last_checkpoint(run.path)
         if not path.exists():
             path.parent.mkdir(exist_ok=True)
             save_checkpoint(

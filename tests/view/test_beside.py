@@ -11,6 +11,7 @@ import urllib.request
 import pytest
 
 from neilfpp_method.cli import main
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.view.address import check_free
 from neilfpp_method.view.beside import viewer_beside
 
@@ -40,7 +41,7 @@ def test_the_page_is_served_while_the_context_runs(tmp_path, port):
 def test_a_failed_viewer_is_reported_and_does_not_affect_the_training(found, tmp_path, port):
     run, said = tmp_path / "run", []
     shutil.copytree(found, run)
-    (run / "checkpoints" / "last.pt").write_bytes(b"not a checkpoint")
+    last_checkpoint(run).write_bytes(b"not a checkpoint")
     with viewer_beside(run, port, "cpu", said.append) as viewer:
         viewer.wait(PATIENCE)
     assert "the viewer ended early: error: " in said[-1]

@@ -1,3 +1,7 @@
+"""Cameras of the browser are converted to cameras of the scene frame and back."""
+
+from __future__ import annotations
+
 import math
 
 import numpy as np

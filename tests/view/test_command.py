@@ -1,3 +1,7 @@
+"""`neilfpp view`: what it serves, and what it refuses in one line."""
+
+from __future__ import annotations
+
 import os
 import shutil
 import socket
@@ -10,11 +14,12 @@ import pytest
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import write_exr
+from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.view import command
 from neilfpp_method.view.address import check_free
 
 
-def request(run: Path, port: int, **changes) -> command.Request:
+def request(run: Path, port: int, **changes) -> command.ViewRequest:
     usual = {
         "env": (),
         "env_layout": "ours",
@@ -23,7 +28,7 @@ def request(run: Path, port: int, **changes) -> command.Request:
         "resolution": 32,
         "checkpoint": "last",
     }
-    return command.Request(run=run, port=port, device="cpu", **{**usual, **changes})
+    return command.ViewRequest(run=run, port=port, device="cpu", **{**usual, **changes})
 
 
 def ends(capsys, *words: str) -> str:
@@ -63,7 +68,7 @@ def test_following_waits_and_shows_each_new_checkpoint(found, port, tmp_path, mo
         if number == 0:
             shutil.copytree(found, run)
         if number == 2:
-            os.utime(run / "checkpoints" / "last.pt")
+            os.utime(last_checkpoint(run))
         return number == 3
 
     command.view(request(run, port, follow=True), said.append, turn)

@@ -1,3 +1,7 @@
+"""The sizes of the images that the viewer renders, from the measured speed."""
+
+from __future__ import annotations
+
 import pytest
 
 from neilfpp_method.view.pace import BATCH, FIRST_IMAGE, Pace, sizes

@@ -1,3 +1,7 @@
+"""Images are painted in the background, and the newest request comes first."""
+
+from __future__ import annotations
+
 import threading
 
 import pytest

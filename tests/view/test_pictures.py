@@ -15,7 +15,7 @@ from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.incident_map import light_at, light_picture, point_under
 from neilfpp_method.view.pace import Pace
-from neilfpp_method.view.pictures import BOUNCES, FAR, Frame, Request, frames
+from neilfpp_method.view.pictures import BOUNCES, FAR, Frame, PictureRequest, frames
 from neilfpp_method.view.subject import Lighting, own_light, scene_of, subject_of
 
 
@@ -29,7 +29,7 @@ def camera(subject):
     return turntable(subject.run.capture, 2, None, 40)[0].camera
 
 
-def pictures(wish: Request, count: int = 99) -> list[Frame]:
+def pictures(wish: PictureRequest, count: int = 99) -> list[Frame]:
     made = []
     for frame in frames(wish, Pace({wish.layer: 2_000.0})):
         if frame is not None:
@@ -59,7 +59,7 @@ def srgb(linear):
 
 
 def test_images_become_finer_up_to_the_size_of_the_window(subject, camera):
-    made = pictures(Request(subject, camera, "normal", own_light(subject.run)))
+    made = pictures(PictureRequest(subject, camera, "normal", own_light(subject.run)))
     assert [frame.share for frame in made] == sorted(frame.share for frame in made)
     assert made[0].share < 1 == made[-1].share
     assert made[-1].image.shape == (camera.height, camera.width, 3)
@@ -67,7 +67,7 @@ def test_images_become_finer_up_to_the_size_of_the_window(subject, camera):
 
 @pytest.mark.parametrize("layer", ["base_color", "roughness", "metallic"])
 def test_a_layer_shows_the_material_at_the_hit_of_each_pixel(subject, camera, layer):
-    frame = pictures(Request(subject, camera, layer, own_light(subject.run)))[-1]
+    frame = pictures(PictureRequest(subject, camera, layer, own_light(subject.run)))[-1]
     _, place, ray = cast(subject, camera)
     assert len(ray) > 100
     with torch.no_grad():
@@ -80,7 +80,7 @@ def test_a_layer_shows_the_material_at_the_hit_of_each_pixel(subject, camera, la
 
 
 def test_depth_is_along_the_axis(subject, camera):
-    frame = pictures(Request(subject, camera, "normal", own_light(subject.run)))[-1]
+    frame = pictures(PictureRequest(subject, camera, "normal", own_light(subject.run)))[-1]
     _, place, ray = cast(subject, camera)
     depth = (place @ camera.w2c[2, :3]) + camera.w2c[2, 3]
     assert np.percentile(np.abs(frame.depth.reshape(-1)[ray] - depth), 98) < 1e-3
@@ -90,7 +90,9 @@ def test_depth_is_along_the_axis(subject, camera):
 def test_pbr_converges_to_the_image_of_the_path_tracer(subject, camera):
     """Many samples of both, with different random numbers."""
     light = own_light(subject.run)
-    made = [frame for frame in pictures(Request(subject, camera, "pbr", light), 40) if frame.share == 1]
+    made = [
+        frame for frame in pictures(PictureRequest(subject, camera, "pbr", light), 40) if frame.share == 1
+    ]
     assert [frame.samples for frame in made] == list(range(1, len(made) + 1))
     picture = render_picture(scene_of(subject, light), camera, Budget(64), BOUNCES, seed=7)
     inside = (picture.alpha[..., 0] > 0.999).numpy()
@@ -104,7 +106,7 @@ def test_twice_the_light_is_one_stop_brighter(subject, camera):
     light = own_light(subject.run)
     brighter = Lighting(replace(light.sky, radiance=2 * light.sky.radiance), None, own=False)
     last = [
-        pictures(Request(subject, camera, "pbr", shone, exposure), 6)[-1].image
+        pictures(PictureRequest(subject, camera, "pbr", shone, exposure), 6)[-1].image
         for shone, exposure in ((brighter, 0.0), (light.with_lamps(None), 1.0))
     ]
     assert np.abs(last[0].astype(int) - last[1]).max() <= 1
@@ -113,7 +115,7 @@ def test_twice_the_light_is_one_stop_brighter(subject, camera):
 def test_a_free_light_shows_pbr_too(given, camera):
     subject = subject_of(load_run(given), 32)
     assert own_light(subject.run).sky is None
-    frame = pictures(Request(subject, camera, "pbr", own_light(subject.run)))[-1]
+    frame = pictures(PictureRequest(subject, camera, "pbr", own_light(subject.run)))[-1]
     assert frame.share == 1
     assert frame.image.std() > 5
 
@@ -131,7 +133,7 @@ def test_a_run_without_a_surface_shows_r_with_a_note(found, camera):
     empty = subject_of(run, 32)
     assert empty.layers == ("radiance",)
     assert empty.note.startswith("Only R can be shown: no surface within")
-    assert pictures(Request(empty, camera, "radiance", own_light(run)))[-1].share == 1
+    assert pictures(PictureRequest(empty, camera, "radiance", own_light(run)))[-1].share == 1
     assert point_under(empty, (3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)) is None
 
 

@@ -97,7 +97,7 @@ def test_half_precision_is_summed_in_float32():
     assert found.opacity.item() == pytest.approx(-math.expm1(-1.0), rel=1e-5)
 
 
-def test_gradients():
+def test_gradients_agree_with_differences():
     density, distances, far = (torch.from_numpy(a).requires_grad_() for a in rays(2, 5))
     values = torch.rand(2, 5, 3, dtype=torch.float64, requires_grad=True)
 

@@ -29,7 +29,7 @@ def test_low_density_keeps_its_relative_precision_in_float32():
     )  # 2e-17, far below 1 − (1 − 2e-17)
 
 
-def test_gradients():
+def test_gradients_agree_with_differences():
     sdf = torch.tensor([-0.7, -0.05, 0.02, 0.9], dtype=torch.float64).repeat(2, 1).requires_grad_()
     beta = torch.tensor([[0.2], [0.05]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(laplace_density, (sdf, beta))

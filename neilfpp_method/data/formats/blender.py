@@ -45,7 +45,7 @@ def read(root: Path) -> CaptureFiles:
     )
     box = find_box(views)
     split = frozenset(names[len(train) :]) if held_out else None
-    return CaptureFiles(root, views, box.normalisation, test=split, scene_from=box.source)
+    return CaptureFiles(root, views, box.normalization, test=split, scene_from=box.source)
 
 
 def _mask(root: Path, frame: Frame) -> Path | None:

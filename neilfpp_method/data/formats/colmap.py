@@ -83,7 +83,7 @@ def read(root: Path) -> CaptureFiles:
         points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
     cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
     box = find_box(views, points[np.isfinite(points).all(axis=1)])
-    return CaptureFiles(inputs, tuple(views), box.normalisation, cloud, scene_from=box.source)
+    return CaptureFiles(inputs, tuple(views), box.normalization, cloud, scene_from=box.source)
 
 
 def open_model(folder: Path) -> pycolmap.Reconstruction:

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from scipy.linalg import rq
 
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalization, View, inside
 from neilfpp_method.errors import UserError
 
 __all__ = ["LAYOUT", "read", "recognize"]
@@ -63,7 +63,7 @@ def read(root: Path) -> CaptureFiles:
             _matrix(matrices, f"world_mat_{i}", archive), header.width, header.height, archive, i
         )
         views.append(View(image.stem, i, camera, image, masks[i] if masks else None))
-    return CaptureFiles(root, tuple(views), _normalisation(matrices, len(images), archive))
+    return CaptureFiles(root, tuple(views), _normalization(matrices, len(images), archive))
 
 
 def _matrices(archive: Path) -> Mapping[str, np.ndarray]:
@@ -116,7 +116,7 @@ def _camera(world_mat: Float64[np.ndarray, "4 4"], width: int, height: int, arch
     return Camera(fx, fy, cx, cy, width, height, w2c)
 
 
-def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path) -> Normalisation:
+def _normalization(matrices: Mapping[str, np.ndarray], count: int, archive: Path) -> Normalization:
     """The unit sphere of the scale matrices, which have to agree: all views see one scene."""
     all_scales = np.stack([_matrix(matrices, f"scale_mat_{i}", archive) for i in range(count)])
     matrix = all_scales[0]
@@ -126,7 +126,7 @@ def _normalisation(matrices: Mapping[str, np.ndarray], count: int, archive: Path
     if not np.allclose(all_scales, matrix, rtol=1e-4, atol=1e-4 * scale):
         raise UserError(f"{archive}: the scale matrices differ", "give all views the same")
     x, y, z = map(float, matrix[:3, 3])
-    return Normalisation(float(scale), (x, y, z))
+    return Normalization(float(scale), (x, y, z))
 
 
 def _files(root: Path, folder: Path) -> tuple[Path, ...]:

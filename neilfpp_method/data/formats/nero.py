@@ -17,7 +17,7 @@ import numpy as np
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
 from neilfpp_method.data.formats.places import stored_image
 from neilfpp_method.data.images import image_header
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalization, View, inside
 from neilfpp_method.errors import UserError
 
 __all__ = ["LAYOUT", "read", "recognize"]
@@ -41,7 +41,7 @@ def read(root: Path) -> CaptureFiles:
     """
     count = sum(1 for path in root.glob(f"*{SUFFIX}") if path.name.removesuffix(SUFFIX).isdigit())
     return CaptureFiles(
-        root, tuple(_view(root, i) for i in range(count)), Normalisation(1.0, (0.0, 0.0, 0.0))
+        root, tuple(_view(root, i) for i in range(count)), Normalization(1.0, (0.0, 0.0, 0.0))
     )
 
 

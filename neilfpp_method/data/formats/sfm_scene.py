@@ -24,7 +24,7 @@ from neilfpp_method.data.formats.places import check_masks, stored, stored_image
 from neilfpp_method.data.images import IMAGE_SUFFIXES
 from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.point_cloud import read_oriented_ply
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalisation, View, inside
+from neilfpp_method.data.views import Camera, CaptureFiles, Normalization, View, inside
 from neilfpp_method.errors import UserError
 
 __all__ = ["LAYOUT", "read", "recognize"]
@@ -73,7 +73,7 @@ def read(root: Path) -> CaptureFiles:
     _refuse_strays(views, {Path(name).stem for name in listed.values()}, path)
     cloud = inputs / POINT_CLOUD
     point_cloud = inside(root, cloud) if cloud.is_file() else None
-    return CaptureFiles(inputs, views, _normalisation(scene, point_cloud), point_cloud)
+    return CaptureFiles(inputs, views, _normalization(scene, point_cloud), point_cloud)
 
 
 def _number_of(tracks: Entry) -> Callable[[str], int]:
@@ -121,7 +121,7 @@ def _refuse_strays(views: tuple[View, ...], listed: set[str], scene: Path) -> No
                 )
 
 
-def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
+def _normalization(scene: Entry, point_cloud: Path | None) -> Normalization:
     """The centre, and half of the largest extent, of the box; without a box, of the point cloud."""
     if "bbox" in scene.entries():
         entry = scene["bbox"]["transform"]
@@ -137,4 +137,4 @@ def _normalisation(scene: Entry, point_cloud: Path | None) -> Normalisation:
         )
     if extents.min() < 0 or extents.max() == 0:
         raise UserError(f"{where}: the box is empty or inside out", "give the full extents on the diagonal")
-    return Normalisation(float(extents.max() / 2), tuple(map(float, center)))
+    return Normalization(float(extents.max() / 2), tuple(map(float, center)))

@@ -70,7 +70,7 @@ def read(root: Path) -> CaptureFiles:
     return CaptureFiles(
         inputs=root,
         views=views,
-        normalisation=box.normalisation,
+        normalization=box.normalization,
         point_cloud=points.oriented,
         test=_held_out(root, entry, views),
         hdr=response and response.word("linear", "srgb") == "linear",

@@ -36,8 +36,8 @@ def write_sfm_scene(capture: Capture, out: Path) -> Path:
                 "camera": {"intrinsic": intrinsic, "extrinsic": camera.w2c.reshape(-1).tolist()},
             }
             files[str(i)] = view.image.relative_to(inputs).as_posix()
-        box = np.diag([2 * capture.normalisation.scale] * 3 + [1.0])
-        box[:3, 3] = capture.normalisation.center
+        box = np.diag([2 * capture.normalization.scale] * 3 + [1.0])
+        box[:3, 3] = capture.normalization.center
         scene = {
             "camera_track_map": {"images": tracks},
             "image_path": {"file_paths": files},

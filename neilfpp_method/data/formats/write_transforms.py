@@ -38,7 +38,7 @@ def write_transforms(capture: Capture, out: Path) -> Path:
         description: dict[str, Any] = {
             "camera_model": FISHEYE if fisheye else "OPENCV",
             "response": "linear" if capture.hdr else "srgb",
-            "scene": {"centre": list(capture.normalisation.center), "radius": capture.normalisation.scale},
+            "scene": {"centre": list(capture.normalization.center), "radius": capture.normalization.scale},
         }
         if capture.point_cloud is not None:
             cloud = copy_file(capture.point_cloud, out / "points.ply")

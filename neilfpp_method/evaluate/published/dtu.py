@@ -211,7 +211,7 @@ def _check(run: Run) -> None:
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     scan = read_scan(run.capture)
     mesh = surface_mesh(run, RESOLUTION)
-    vertices = run.capture.normalisation.to_world(torch.from_numpy(np.array(mesh.vertices, np.float64)))
+    vertices = run.capture.normalization.to_world(torch.from_numpy(np.array(mesh.vertices, np.float64)))
     return chamfer_of_scan(vertices.numpy(), np.asarray(mesh.faces), scan)
 
 

@@ -199,7 +199,7 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
 
 def _along_axis(capture: Capture, view: View, rendered: RenderedView) -> Mask:
     """Depth along the axis of the camera, scene units, from the depth along the rays."""
-    camera = capture.normalisation.camera(view.camera)
+    camera = capture.scene_camera(view)
     cosine = camera_rays(camera).directions.double().numpy() @ camera.w2c[2, :3]
     return rendered.maps["depth"][..., 0] * cosine.reshape(SIDE, SIDE).astype(np.float32)
 

@@ -47,11 +47,13 @@ class AssetOptions:
     """Options of an asset.
 
     Attributes:
+        resolution: resolution of the fine surface (`extract_mesh`).
         texture_size: width and height of the textures, texels.
         faces: largest number of triangles.
         error: largest distance, scene units, that simplification below `faces` may cause.
     """
 
+    resolution: int
     texture_size: int
     faces: int
     error: float
@@ -87,29 +89,27 @@ def check_asset(run: Run, options: AssetOptions) -> None:
 def export_asset(
     run: Run,
     out: Path,
-    resolution: int,
     options: AssetOptions,
-    console: Console,
-    bar: Bar,
     deviations: Deviations | None,
+    bar: Bar,
+    console: Console,
 ) -> None:
     """Write the asset of a run into a folder. Lengths are in world units.
 
     Args:
         run: the run, for which `check_asset` has succeeded.
         out: the folder to write.
-        resolution: resolution of the fine surface (`extract_mesh`).
         options: options of the asset.
-        console: receives messages for the user.
-        bar: shows the progress of baking.
         deviations: computes expected errors for an additional texture; None for no such texture.
+        bar: shows the progress of baking.
+        console: receives messages for the user.
 
     Raises:
         UserError: there is no surface, no camera sees it, the charts do not fit on the texture, or the folder
             cannot be written.
     """
-    full = fine_surface(run, resolution)
-    cameras = [run.capture.normalisation.camera(view.camera) for view in run.capture.train_views]
+    full = fine_surface(run, options.resolution)
+    cameras = [run.capture.scene_camera(view) for view in run.capture.train_views]
     fine = clean(full, visible_faces(full, cameras))
     console.print(f"surface: kept {len(fine.faces)} of {len(full.faces)} triangles, which cameras see")
     coarse = simplified(fine, options.faces, options.error)
@@ -125,7 +125,7 @@ def export_asset(
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
     )
-    vertices = run.capture.normalisation.to_world(torch.from_numpy(mesh.vertices)).numpy()
+    vertices = run.capture.normalization.to_world(torch.from_numpy(mesh.vertices)).numpy()
     write_asset(run, replace(mesh, vertices=vertices), textures, out)
     if not has_usd():
         remedy = "pip install 'neilfpp-method[usd]'"

@@ -62,7 +62,7 @@ def test_cameras_masks_and_splits(tmp_path: Path, hdr: bool) -> None:
     masks = [view.mask and view.mask.parent.name for view in capture.views]
     assert masks == (["train_mask"] * 4 + ["test_mask"] * 2 if hdr else [None] * 6)
     assert capture.scene_from == "masks"
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.3 * RADIUS)
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.3 * RADIUS)
 
 
 def test_without_a_test_file_every_eighth_view_is_held_out(tmp_path: Path) -> None:

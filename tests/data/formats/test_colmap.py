@@ -114,8 +114,8 @@ def test_the_scene_box_comes_from_the_sparse_points(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
     capture = load_capture(tmp_path)
     assert capture.scene_from == "points"
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.05 * RADIUS)
-    assert RADIUS < capture.normalisation.scale < 1.15 * RADIUS
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.05 * RADIUS)
+    assert RADIUS < capture.normalization.scale < 1.15 * RADIUS
     assert capture.point_cloud is None  # sparse points have no normals
 
 
@@ -124,11 +124,11 @@ def test_the_scene_box_comes_from_the_points_of_the_object(tmp_path: Path) -> No
     for point in np.random.default_rng(4).uniform(-20, 20, (600, 3)):  # the room
         model.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
     write(material(tmp_path, masks=None), model, "colmap/sparse/0")
-    assert load_capture(tmp_path).normalisation.scale < 3  # the focus of the cameras, not the room
+    assert load_capture(tmp_path).normalization.scale < 3  # the focus of the cameras, not the room
     (tmp_path / "cloud.ply").rename(tmp_path / "object_point_cloud.ply")
     capture = load_capture(tmp_path)
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.05 * RADIUS)
-    assert RADIUS < capture.normalisation.scale < 1.15 * RADIUS
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.05 * RADIUS)
+    assert RADIUS < capture.normalization.scale < 1.15 * RADIUS
 
 
 def test_the_dense_cloud_and_masks_are_found(tmp_path: Path) -> None:

@@ -69,9 +69,9 @@ def test_projection_matrices(tmp_path: Path, factor: float, folder: str, archive
 
 
 def test_the_scale_matrix_is_the_scene_frame(tmp_path: Path) -> None:
-    normalisation = load_capture(scan(tmp_path)).normalisation
-    assert normalisation.scale == SCALE
-    assert normalisation.center == tuple(CENTER)
+    normalization = load_capture(scan(tmp_path)).normalization
+    assert normalization.scale == SCALE
+    assert normalization.center == tuple(CENTER)
 
 
 def test_masks_are_assigned_by_order_if_names_differ(tmp_path: Path) -> None:

@@ -40,10 +40,10 @@ def scene(root: Path, protocol: int = 4, kind: type = np.float64) -> Path:
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_cameras(tmp_path: Path, protocol: int, kind: type) -> None:
+def test_cameras_project_as_pinholes(tmp_path: Path, protocol: int, kind: type) -> None:
     capture = load_capture(scene(tmp_path, protocol, kind))
     assert capture.format == "nero"
-    assert (capture.normalisation.scale, capture.normalisation.center) == (1.0, (0.0, 0.0, 0.0))
+    assert (capture.normalization.scale, capture.normalization.center) == (1.0, (0.0, 0.0, 0.0))
     assert [view.name for view in capture.views] == [str(i) for i in range(VIEWS)]
     for i, view in enumerate(capture.views):
         seen = project(view.camera, torch.from_numpy(POINTS)).pixel.numpy()

@@ -177,7 +177,7 @@ def test_points_project_to_known_pixels(tmp_path: Path, layout: str, world: str)
     for i, view in enumerate(capture.views):
         assert np.abs(project(view.camera, points).pixel.numpy() - pinhole_pixels(i)).max() < TOLERANCE
         # The scene frame is the world frame, shifted and scaled, so the projections are the same.
-        seen = project(capture.normalisation.camera(view.camera), capture.normalisation.to_scene(points))
+        seen = project(capture.scene_camera(view), capture.normalization.to_scene(points))
         assert np.abs(seen.pixel.numpy() - pinhole_pixels(i)).max() < TOLERANCE
 
 

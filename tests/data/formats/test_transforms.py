@@ -86,7 +86,7 @@ def test_a_world_with_y_up_is_unchanged(tmp_path: Path) -> None:
     root = scene(tmp_path, world=y_up, applied_transform=np.pad(y_up, ((0, 0), (0, 1))).tolist())
     seen = seen_pixels(root, POINTS @ y_up.T)
     assert max(np.abs(seen[i] - pinhole_pixels(i)).max() for i in range(VIEWS)) < 1e-6
-    assert np.allclose(load_capture(root).normalisation.center, y_up @ CENTER, atol=0.2 * RADIUS)
+    assert np.allclose(load_capture(root).normalization.center, y_up @ CENTER, atol=0.2 * RADIUS)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_world_with_y_up_is_unchanged(tmp_path: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("place", ["file", "frame"])
-def test_lenses(
+def test_lenses_project_as_in_opencv(
     tmp_path: Path, model: str | None, names: dict[str, float], fisheye: bool, place: str
 ) -> None:
     scene(tmp_path, camera_model=model, **({} if model else {"is_fisheye": fisheye}))
@@ -200,7 +200,7 @@ def test_masks_and_the_scene_box_from_them(tmp_path: Path) -> None:
     capture = load_capture(edit(tmp_path, add))
     assert capture.scene_from == "masks"
     assert [view.mask.name for view in capture.views] == [f"{i:03d}.png" for i in range(VIEWS)]
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.25 * RADIUS)
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.25 * RADIUS)
 
 
 @pytest.mark.parametrize("normals", [True, False])
@@ -211,11 +211,11 @@ def test_the_point_cloud(tmp_path: Path, normals: bool) -> None:
         trimesh.PointCloud(points).export(tmp_path / "cloud.ply")
     capture = load_capture(tmp_path)
     assert capture.scene_from == "points"
-    assert np.allclose(capture.normalisation.center, CENTER, atol=0.05 * RADIUS)
+    assert np.allclose(capture.normalization.center, CENTER, atol=0.05 * RADIUS)
     assert capture.point_cloud == (tmp_path / "cloud.ply" if normals else None)
 
 
-def test_split_lists(tmp_path: Path) -> None:
+def test_lists_of_files_split_the_views(tmp_path: Path) -> None:
     files = [f"images/{i:03d}.exr" for i in range(VIEWS)]
     scene(tmp_path, train_filenames=files[:4], val_filenames=files[4:5], test_filenames=files[5:])
     assert load_capture(tmp_path).test == {"005"}
@@ -227,7 +227,7 @@ def test_split_lists(tmp_path: Path) -> None:
     )
 
 
-def test_hdr_and_ldr(tmp_path: Path) -> None:
+def test_the_kind_of_files_determines_the_response(tmp_path: Path) -> None:
     assert load_capture(scene(tmp_path / "hdr")).hdr
     assert not load_capture(scene(tmp_path / "ldr", hdr=False)).hdr
     assert load_capture(edit(tmp_path / "ldr", lambda c: c.update(response="linear"))).hdr

@@ -60,7 +60,7 @@ def bent(captured: Capture, model: str) -> Capture:
 def test_a_written_capture_is_read_back(tmp_path: Path, writer: str, hdr: bool, masks: bool) -> None:
     first = capture(tmp_path / "in", hdr, masks)
     back = written(first, writer, tmp_path / "out")
-    assert back.normalisation == first.normalisation
+    assert back.normalization == first.normalization
     assert back.scene_from == "box"
     assert (back.hdr, back.test) == (first.hdr, first.test)
     assert back.point_cloud.read_bytes() == first.point_cloud.read_bytes()

@@ -91,6 +91,5 @@ def write_ball(
     deviations=None,
     resolution: int = 48,
 ) -> None:
-    export_asset(
-        run, out, resolution, AssetOptions(size, faces, error), Console(quiet=True), no_bar, deviations
-    )
+    options = AssetOptions(resolution, size, faces, error)
+    export_asset(run, out, options, deviations, no_bar, Console(quiet=True))

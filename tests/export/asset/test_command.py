@@ -79,7 +79,7 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
         (["--out", "FILE/out"], ("cannot be written",)),
     ],
 )
-def test_bad_options(given, tmp_path, capfd, options, words):
+def test_bad_options_are_refused(given, tmp_path, capfd, options, words):
     (tmp_path / "file").write_text("")
     options = [option.replace("FILE", str(tmp_path / "file")) for option in options]
     command = ["export", given, "--what", "asset", "--out", tmp_path / "out", "--device", "cpu", *options]

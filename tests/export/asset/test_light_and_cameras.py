@@ -136,7 +136,7 @@ def own_picture(run: Run, view: str) -> tuple[np.ndarray, np.ndarray]:
     """Image of the true sphere by the run's own rendering equation, (H, W, 3), and the pixels inside its
     outline, (H, W), that show no lamp.
     """
-    camera = run.capture.normalisation.camera(next(v.camera for v in run.capture.views if v.name == view))
+    camera = run.capture.normalization.camera(next(v.camera for v in run.capture.views if v.name == view))
     rays = camera_rays(camera)
     position, hit = meet_ball(RayBatch(rays.origins, rays.directions), RADIUS)
     rows = torch.nonzero(hit)[:, 0]

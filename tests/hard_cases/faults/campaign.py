@@ -29,7 +29,7 @@ from neilfpp_method.cli import main as neilfpp
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.presets import PRESETS
-from neilfpp_method.train.run import load_checkpoint
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences, small_config
 
@@ -134,7 +134,7 @@ def attack_training(report: Report, folder: Path, draw: random.Random, kills: in
     took = run(folder, *train_words(folder, whole, resume=False))
     if took.status:
         raise RuntimeError(took.said)
-    wanted = torch.load(whole / "checkpoints" / "last.pt", weights_only=True)
+    wanted = torch.load(last_checkpoint(whole), weights_only=True)
     number = 0
     while sum(report.kills.values()) < kills:
         out, number = folder / f"run-{number}", number + 1
@@ -150,7 +150,7 @@ def attack_training(report: Report, folder: Path, draw: random.Random, kills: in
         if ended.status:
             report.faults.append(f"train goes on: status {ended.status}: {ended.said[-800:]}")
             continue
-        found = torch.load(out / "checkpoints" / "last.pt", weights_only=True)
+        found = torch.load(last_checkpoint(out), weights_only=True)
         report.faults += [
             f"train: {place} is not that of a run that was never killed"
             for place in differences(found, wanted)

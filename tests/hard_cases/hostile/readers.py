@@ -28,14 +28,15 @@ from neilfpp_method.data.photo_exposure import photo_exposure, read_exposures
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import has_normals, read_oriented_ply, read_positions
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import Normalisation
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.settings.files import read_settings
 from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import preset
+from neilfpp_method.train.checkpoint import load_checkpoint, load_weights, save_checkpoint
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.light_record import read_fits
-from neilfpp_method.train.run import load_checkpoint, load_weights, read_description, save_checkpoint
+from neilfpp_method.train.run import read_description
 from neilfpp_method.train.work_record import read_work
 from tests.data.formats import test_blender, test_colmap, test_dtu, test_nero, test_transforms
 from tests.data.make_capture import make_capture
@@ -43,7 +44,7 @@ from tests.data.test_capture_folder import folder as own_capture
 
 __all__ = ["READERS", "Reader"]
 
-UNIT = Normalisation(1.0, (0.0, 0.0, 0.0))
+UNIT = Normalization(1.0, (0.0, 0.0, 0.0))
 SIZE = (18, 24)
 
 
@@ -217,9 +218,9 @@ def _read_capture(folder: Path, damaged: Path) -> None:
         for path in (view.image, view.mask, view.valid):
             assert path is None or path.resolve().is_relative_to(inside), f"{path} is outside the capture"
     assert capture.point_cloud is None or capture.point_cloud.resolve().is_relative_to(inside)
-    assert np.isfinite(capture.normalisation.scale)
-    assert capture.normalisation.scale > 0
-    assert np.isfinite(capture.normalisation.center).all()
+    assert np.isfinite(capture.normalization.scale)
+    assert capture.normalization.scale > 0
+    assert np.isfinite(capture.normalization.center).all()
     pixels = PixelDataset(capture, capture.views)
     batch = pixels.sample(16)
     assert batch.color.isfinite().all()

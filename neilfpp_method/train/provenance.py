@@ -1,4 +1,4 @@
-"""Command line, versions and hardware, for the record of a run."""
+"""Provenance of a run: command line, versions and hardware."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-__all__ = ["environment", "processor_name"]
+__all__ = ["processor_name", "provenance"]
 
 PACKAGES = (
     "neilfpp-method",
@@ -26,7 +26,7 @@ PACKAGES = (
 """Packages whose versions are recorded."""
 
 
-def environment() -> dict[str, Any]:
+def provenance() -> dict[str, Any]:
     """Command line, versions and hardware, for the record of a run."""
     versions = {}
     for package in PACKAGES:

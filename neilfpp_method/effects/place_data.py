@@ -1,0 +1,77 @@
+"""Places together with the light transport to their pixels: the data to which light and materials are fitted.
+
+Because there are few places, the transport is stored as a matrix for each roughness of the grid.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from neilfpp_method.effects.material_grid import ROUGHNESSES
+from neilfpp_method.effects.places import Places
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.lighting.layered_transport import texel_layers
+from neilfpp_method.lighting.transport import Transport
+from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.structures import SceneTracer
+
+__all__ = ["PlaceData", "Split", "place_transport"]
+
+ROWS = 16
+"""Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
+DIRECTIONS = 4
+"""Random directions per texel and pixel: a lobe of roughness 0.2 is narrower than a texel."""
+
+
+@dataclass(frozen=True)
+class PlaceData:
+    """What a fit of light and materials explains.
+
+    Attributes:
+        places: places with their pixels, in linear radiance.
+        transport: the transport to these pixels (`place_transport`).
+        typical: radiance of a typical pixel.
+    """
+
+    places: Places
+    transport: Transport
+    typical: float
+
+    def where(self, rows: Tensor) -> PlaceData:
+        """The same places with only some of the pixels."""
+        return PlaceData(self.places.where(rows), self.transport[rows], self.typical)
+
+    def hold_back(self, fold: int, folds: int) -> Split:
+        """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
+        is_held_back = self.places.view % folds == fold
+        return Split(
+            self.where(torch.nonzero(~is_held_back)[:, 0]), self.where(torch.nonzero(is_held_back)[:, 0])
+        )
+
+
+@dataclass(frozen=True)
+class Split:
+    """The pixels of the views to which models are fitted, and those of the held-back views."""
+
+    known: PlaceData
+    held_back: PlaceData
+
+
+@torch.no_grad()
+def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Transport:
+    """The transport from the texels of a map to N pixels, with the layers of `lighting.layered_transport`.
+
+    It takes 21 kB per pixel. Rays are traced once per place.
+    """
+    environment = EnvironmentLight(ROWS, 1.0).to(places.place.device)
+    shared = places.shared_points()
+    drawn = [texel_layers(environment, shared, ROUGHNESSES, lobe, scene) for _ in range(DIRECTIONS)]
+    sources, scene_light = (
+        functools.reduce(torch.add, (getattr(part, name) / DIRECTIONS for part in drawn))
+        for name in ("sources", "scene")
+    )
+    return Transport(sources, scene_light)

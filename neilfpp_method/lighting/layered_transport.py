@@ -1,0 +1,159 @@
+"""Light transport at several roughnesses at once, for pixels that share surface points.
+
+Rays are traced once per surface point, regardless of how many pixels show it and how many roughnesses are
+tried. The result has one layer for each part of the BRDF (see `transport`): layer 0 is the diffuse part, and
+layers 1 + 2k and 2 + 2k are the facing and grazing parts at roughness number k.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.lamp_transport import in_sight, lamp_kernel
+from neilfpp_method.lighting.map_transport import TexelRays, trace_texels
+from neilfpp_method.lighting.transport import Transport, brdf_kernel, spans
+from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.structures import Observed, SceneTracer
+
+__all__ = ["SharedPoints", "lamp_layers", "layers_at", "light_layers", "texel_layers"]
+
+
+@dataclass(frozen=True)
+class SharedPoints:
+    """P surface points, each shown by some of N pixels.
+
+    Attributes:
+        position: the points from which rays are traced, scene frame.
+        normal: their unit normals.
+        observed: the surface point that each pixel shows, for its normal and its direction to the viewer.
+        point: index of the point at which the rays of each pixel start.
+    """
+
+    position: Float[Tensor, "P 3"]
+    normal: Float[Tensor, "P 3"]
+    observed: Observed
+    point: Int[Tensor, " N"]
+
+
+@torch.no_grad()
+def texel_layers(
+    environment: EnvironmentLight,
+    shared: SharedPoints,
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+    scene: SceneTracer | None,
+) -> Transport:
+    """The transport from the texels of a map at several roughnesses, per unit of radiance.
+
+    One random direction per point and texel is traced, and what it hits occludes the whole texel. The BRDF of
+    each pixel is evaluated in another random direction within the texel, so that the pixels of a point have
+    independent errors.
+
+    Args:
+        environment: the map; only its shape is used, not its radiance.
+        shared: the surface points and the pixels that show them.
+        roughnesses: the values of roughness.
+        lobe: the specular lobe.
+        scene: as in `map_transport.from_texels`.
+
+    Returns:
+        The transport in layers; `sources` has half precision.
+    """
+    return Transport.joined(list(_texel_layers(environment, shared, roughnesses, lobe, scene)))
+
+
+@torch.no_grad()
+def light_layers(
+    light: LightModel,
+    shared: SharedPoints,
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+    scene: SceneTracer | None,
+) -> Float[Tensor, "K N 3"]:
+    """The layers of outgoing radiance that a known map, known lamps and the scene cause.
+
+    No transport matrix is stored, so that the map may have any size. Arguments as in `texel_layers`.
+    """
+    environment, lamps = light.light, light.lamps
+    radiance = environment.log_radiance.exp().flatten(1).t()
+    parts = _texel_layers(environment, shared, roughnesses, lobe, scene)
+    total = torch.cat([part.sources.float() @ radiance + part.scene for part in parts], 1)
+    if lamps.count:
+        sight = in_sight(lamps.lit_places, lamps.radius, shared.position, scene)[shared.point]
+        total += lamp_layers(lamps, sight, shared.observed, roughnesses, lobe)
+    return total
+
+
+def lamp_layers(
+    lamps: Lamps,
+    sight: Bool[Tensor, "N M"],
+    observed: Observed,
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+) -> Float[Tensor, "K N 3"]:
+    """The layers of outgoing radiance that the lit lamps cause.
+
+    Args:
+        lamps: the lamps.
+        sight: which of the lit lamps are visible from each point (`lamp_transport.in_sight`).
+        observed: the surface points, with unit normals and directions to the viewer.
+        roughnesses: the values of roughness.
+        lobe: the specular lobe.
+    """
+    layers = []
+    for number, value in enumerate(roughnesses):
+        roughness = torch.full_like(observed.position[:, :1], value)
+        kernel = lamp_kernel(lamps.lit_places, lamps.radius, sight, observed, roughness, lobe)
+        layers.append((kernel if number == 0 else kernel[1:]) @ lamps.lit_intensity)
+    return torch.cat(layers)
+
+
+def layers_at(layers: Tensor, number: Int[Tensor, " N"]) -> Tensor:
+    """The diffuse, facing and grazing parts of each pixel at its own roughness.
+
+    Args:
+        layers: (K, N, C) all layers.
+        number: index of the roughness of each pixel.
+
+    Returns:
+        (3, N, C) the three parts.
+    """
+    rows = torch.arange(len(number), device=number.device)
+    return layers[torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number)), rows]
+
+
+def _texel_layers(
+    environment: EnvironmentLight,
+    shared: SharedPoints,
+    roughnesses: Sequence[float],
+    lobe: Lobe,
+    scene: SceneTracer | None,
+) -> Iterator[Transport]:
+    """The result of `texel_layers` for consecutive spans of pixels."""
+    texels = environment.log_radiance[0].numel()
+    rays = TexelRays.joined(
+        [
+            trace_texels(environment, shared.position[span], shared.normal[span], scene)
+            for span in spans(len(shared.position), texels)
+        ]
+    )
+    for span in spans(len(shared.observed), texels):
+        observed = shared.observed[span]
+        drawn = rays[shared.point[span]].redrawn(environment, observed)
+        layers = []
+        for number, value in enumerate(roughnesses):
+            roughness = torch.full_like(observed.position[:, :1], value)
+            kernel = brdf_kernel(observed, roughness, drawn.wi, drawn.weight, lobe)
+            layers.append(drawn.transport(kernel if number == 0 else kernel[1:]))
+        yield Transport(
+            torch.cat([layer.sources.half() for layer in layers]),
+            torch.cat([layer.scene for layer in layers]),
+        )
