@@ -41,6 +41,7 @@ TRUE_EFFECTS: Mapping[str, set[str]] = {
     "lambertian": SKY,
     "lamp": {"inter-reflection", "lamps", *GLOSSY},
     "bowl": {"inter-reflection", "environment-map", "reflection", "lobe-sampling"},
+    "polished": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "tabletop_env": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "tabletop_mix": {"inter-reflection", "lamps", "metals", *SKY, *GLOSSY},
     "spot_city": {"inter-reflection", "metals", *SKY, *GLOSSY},
