@@ -332,8 +332,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "red and blue swapped",
         "data/images.py",
-        "return samples[..., [2, 1, 0, 3][: samples.shape[2]]]\n\n\ndef _tiff",
-        "return samples\n\n\ndef _tiff",
+        "return samples[..., [2, 1, 0, 3][: samples.shape[2]]]\n\n\ndef _png_samples",
+        "return samples\n\n\ndef _png_samples",
         "data/test_images.py",
     ),
     Mutant(

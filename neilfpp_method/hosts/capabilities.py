@@ -82,6 +82,13 @@ CAPABILITIES = (
         "the width of the surface depends only on the host's own training",
     ),
     Capability(
+        "starts_from_shape",
+        base.StartsFromShape,
+        "training loops",
+        "train.optimizer",
+        "geometry is trained from the first step",
+    ),
+    Capability(
         "may_hit",
         base.PredictsMisses,
         "L_ref",

@@ -35,7 +35,7 @@ def small_paper():
 
 
 def double(batch: PixelBatch) -> PixelBatch:
-    return batch._map(lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)
+    return batch.map(lambda tensor: tensor.double() if tensor.is_floating_point() else tensor)
 
 
 def test_losses_and_gradients_agree():

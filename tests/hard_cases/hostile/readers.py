@@ -32,7 +32,7 @@ from neilfpp_method.data.views import Normalization
 from neilfpp_method.settings.files import read_settings
 from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import preset
-from neilfpp_method.train.checkpoint import load_checkpoint, load_weights, save_checkpoint
+from neilfpp_method.train.checkpoint import FORMAT, load_checkpoint, load_weights, save_checkpoint
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.light_record import read_fits
@@ -302,7 +302,7 @@ def _read_groups(folder: Path, damaged: Path) -> None:
 def _yaml(folder: Path) -> list[Path]:
     (folder / "all.yaml").write_text(yaml.safe_dump(to_dict(preset("fast"))))
     (folder / "some.yaml").write_text("train: {rays: 512, sdf_steps: 100}\nloss.volume: 1.0 # a comment\n")
-    (folder / "all.json").write_text(json.dumps({"format": 2, "config": to_dict(preset("paper-ngp"))}))
+    (folder / "all.json").write_text(json.dumps({"format": FORMAT, "config": to_dict(preset("paper-ngp"))}))
     return sorted(folder.iterdir())
 
 
@@ -347,7 +347,7 @@ RUN_FILES = (
 
 def _run(folder: Path) -> list[Path]:
     contents = {
-        "config.json": {"format": 2, "config": to_dict(preset("fast"))},
+        "config.json": {"format": FORMAT, "config": to_dict(preset("fast"))},
         "capture.json": {
             "root": "captures/a",
             "test_every": 8,
