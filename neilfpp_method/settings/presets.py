@@ -156,7 +156,7 @@ FAST: Mapping[str, Any] = {
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,
     "loss.position_gradient": 0.0,
-    "loss.normal_gradient": 0.1,
+    "loss.normal_gradient": 0.0,
     # In the short joint stage geometry keeps the learning rate with which SDF init ended.
     "optimizer.geometry": 2e-2,
     "optimizer.radiance": 5e-3,
