@@ -21,7 +21,7 @@ from torch import Tensor
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.views import KnownView, known_test_views
-from neilfpp_method.structures import Material, RayBatch
+from neilfpp_method.structures import Material
 from neilfpp_method.train.run import Run, load_run
 
 __all__ = ["Compared", "compare", "markdown"]
@@ -59,8 +59,8 @@ def compare(run: Run) -> Compared:
     return Compared(
         torch.cat([part.hit_error for part in parts]),
         torch.cat([part.shading_error for part in parts]),
-        _joined([part.estimate for part in parts]),
-        _joined([part.truth for part in parts]),
+        Material.joined([part.estimate for part in parts]),
+        Material.joined([part.truth for part in parts]),
     )
 
 
@@ -75,7 +75,7 @@ def _compare_view(run: Run, known: KnownView) -> Compared:
     rows = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:PIXELS]]
     rays = camera_rays(run.capture.scene_camera(known.view))[rows]
     truth = {name: torch.from_numpy(values).flatten(0, 1)[rows] for name, values in known.material.items()}
-    hits = run.model.host.render(RayBatch(rays.origins, rays.directions))
+    hits = run.model.host.render(rays)
     smooth = run.model.shading_normals(hits.position, hits.normal)
     return Compared(
         _angle(hits.normal, normal[rows]),
@@ -87,11 +87,6 @@ def _compare_view(run: Run, known: KnownView) -> Compared:
 
 def _angle(a: Float[Tensor, "N 3"], b: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
     return torch.rad2deg(torch.cosine_similarity(a, b, dim=-1).clamp(-1, 1).acos())
-
-
-def _joined(materials: list[Material]) -> Material:
-    names = ("base_color", "roughness", "metallic")
-    return Material(**{name: torch.cat([getattr(m, name) for m in materials]) for name in names})
 
 
 def groups(truth: Material) -> Mapping[str, Bool[Tensor, " N"]]:
