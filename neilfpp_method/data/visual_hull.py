@@ -11,13 +11,23 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Float64
 from scipy import ndimage
 from torch import Tensor
 
 from neilfpp_method.data.silhouettes import Outline, sightings
 
-__all__ = ["HULL_RADIUS", "RESOLUTION", "DistanceCube", "find_hull", "signed_distance", "visual_hull"]
+__all__ = [
+    "HULL_RADIUS",
+    "MIN_CELLS",
+    "MIN_SEEN_SHARE",
+    "RESOLUTION",
+    "DistanceCube",
+    "cell_centers",
+    "find_hull",
+    "signed_distance",
+    "visual_hull",
+]
 
 HULL_RADIUS = 1.3
 """Half an edge of the carved cube, scene units: the unit sphere, which contains the object, and a margin."""
@@ -104,8 +114,7 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
         radius: half an edge of the cube.
         resolution: number of cells along an edge, R.
     """
-    center = (np.arange(resolution) + 0.5) * (2 * radius / resolution) - radius
-    points = np.stack(np.meshgrid(center, center, center, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = cell_centers(radius, resolution)
     candidates = np.arange(len(points))
     seen_by, excluded_by = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     # Small silhouettes exclude the most points, so fewer points remain for the following views.
@@ -118,6 +127,12 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
     enough_views = seen_by[candidates] >= max(2, MIN_SEEN_SHARE * len(outlines))
     hull[candidates] = enough_views & (excluded_by[candidates] <= MAX_EXCLUDING_SHARE * seen_by[candidates])
     return hull.reshape(resolution, resolution, resolution)
+
+
+def cell_centers(radius: float, resolution: int) -> Float64[np.ndarray, "P 3"]:
+    """Centres of the R³ cells of the cube [−radius, radius]³, z fastest."""
+    center = (np.arange(resolution) + 0.5) * (2 * radius / resolution) - radius
+    return np.stack(np.meshgrid(center, center, center, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def signed_distance(inside: Bool[np.ndarray, "R R R"], cell: float) -> Float32[np.ndarray, "R R R"]:

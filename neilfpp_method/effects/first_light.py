@@ -44,8 +44,10 @@ SCALES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)
 FIRST_SCALE = 0.33
 """The scale that is fitted first, from an even light; every other fit starts from that of the nearest scale.
 """
-LAMP_PIXELS = 1024
-"""Number of pixels for the search for lamps: as many as the light solver remembers in preset `fast`."""
+LAMP_PIXELS = 4096
+"""Number of pixels for the search for lamps. With 1024, the gain by lamps on recovered geometry varied from
+−0.4 % to 2.9 % between random selections (true lamps, standard error 0.5 %); with 4096 from 1.3 % to 2.3 %.
+"""
 CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
 

@@ -213,6 +213,13 @@ class VolSdfHost(nn.Module):
 
     # ----------------------------------------------------------------------------------------------- geometry
 
+    @property
+    def points(self) -> OrientedPoints | None:
+        """The oriented points on the surface for L_pcd, scene frame; None if there are none."""
+        if self.point_position is None:
+            return None
+        return OrientedPoints(self.point_position, self.point_normal)
+
     def _grid(self) -> Float[Tensor, "R R R"]:
         if self.grid_age is None or self.grid_age >= GRID_LIFE:
             fresh = sample_grid(
@@ -339,12 +346,11 @@ class VolSdfHost(nn.Module):
             terms["surface"] = losses.surface(inputs.distance, SURFACE_WIDTH[self.config.loss.points])
         if "hessian" in names:
             terms["hessian"] = losses.hessian(self.sdf_field.hessian(inputs.curved))
-        if "point_cloud" in names and self.point_position is not None:
-            rows = torch.randint(len(self.point_position), (len(batch),), device=self.point_position.device)
-            sample = self.sdf_field.with_gradient(self.point_position[rows])
-            terms["point_cloud"] = losses.point_cloud(
-                sample.distance, sample.gradient, self.point_normal[rows]
-            )
+        if "point_cloud" in names and (points := self.points) is not None:
+            count = len(points.position)
+            drawn = points[torch.randint(count, (len(batch),), device=points.position.device)]
+            sample = self.sdf_field.with_gradient(drawn.position)
+            terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, drawn.normal)
         if "mask" in names:
             terms["mask"] = losses.mask(
                 march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known

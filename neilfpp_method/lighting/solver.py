@@ -196,8 +196,8 @@ class MapSolver(nn.Module):
         environment, lamps = self.light.light, self.light.lamps
         # What cameras saw of the light is stored for the texels of the full map.
         coarse = environment.at_most(START_ROWS) if self.sky is None else environment
-        trial, rows = LightModel(copy.deepcopy(coarse), lamps), slice(self.config.fit.points)
-        measured = self._solve(trial, observed[rows], material[rows], scene, first=True, at_start=True)
+        trial = LightModel(copy.deepcopy(coarse), lamps)
+        measured = self._solve(trial, observed, material, scene, first=True, at_start=True)
         if lamps.count and measured is not None:
             in_views = judge(lamps, self.lobe, scene)
             if in_views.gain < -in_views.deviation:

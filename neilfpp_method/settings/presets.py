@@ -110,7 +110,7 @@ FAST: Mapping[str, Any] = {
     "encoding.sdf_log2_entries": 18,
     "encoding.max_resolution": 256,
     "host.sdf.layers": 1,
-    "host.sdf.start": "silhouettes",
+    "host.sdf.start": "hull",
     "host.sdf.width": 64,
     "host.sdf.feature_width": 15,
     "radiance.positions": "encoded",

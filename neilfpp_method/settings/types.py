@@ -55,8 +55,9 @@ class SdfConfig:
     """Units per hidden layer."""
     feature_width: int = 256
     """Length of the feature vector that R gets."""
-    start: Literal["sphere", "silhouettes"] = "sphere"
-    """Initial shape: a sphere, or the visual hull of the object masks (silhouettes) if there are masks."""
+    start: Literal["sphere", "hull"] = "sphere"
+    """Initial shape: a sphere; or the visual hull of the object masks, or without masks the hull of the point
+    cloud."""
 
 
 @dataclass(frozen=True)

@@ -71,20 +71,20 @@ def set_rates(
 def waiting_fields(model: NeilfModel, config: OptimizerConfig, position: StagePosition) -> set[str]:
     """Name the fields that a step of SDF init does not train yet.
 
-    The background waits until surfaces exist (`config.background_from`), except if structure from motion has
-    found points behind the scene: a constant colour does not represent such a background, and training would
-    explain it by density within the scene instead.
+    The background waits until surfaces exist (`config.background_from`), except if geometry starts from a
+    hull, or if structure from motion has found points behind the scene: a constant colour does not represent
+    such a background, and training would explain it by density within the scene instead.
 
-    Geometry waits for R (`GEOMETRY_FROM`) if it starts from the visual hull. While R does not yet vary with
+    Geometry waits for R (`GEOMETRY_FROM`) if it starts from a hull. While R does not yet vary with
     direction, a mirror is best explained by a dent with the depth of what it reflects, and later training
     does not remove such a dent.
     """
     if position.stage is not Stage.SDF_INIT:
         return set()
     waiting = set()
-    if position.share < config.background_from and not model.facts.far_points:
-        waiting.add("background")
     starts_from_shape = isinstance(model.host, StartsFromShape) and model.host.starts_from_shape
+    if position.share < config.background_from and not (model.facts.far_points or starts_from_shape):
+        waiting.add("background")
     if position.share < GEOMETRY_FROM and starts_from_shape:
         waiting |= {"geometry", "beta"}
     return waiting

@@ -1,8 +1,9 @@
-"""The initial shape of the distance field: the sphere of its initialisation, or the visual hull of the masks.
+"""The initial shape of the distance field: the sphere of its initialisation, or a hull.
 
 Training finds a surface faster, and more often the correct one, if it starts from a shape that has the
-object's outline in every view. Concavities are easily carved out of a visual hull, whereas thin parts do not
-easily grow out of a sphere.
+object's outline in every view: the visual hull of the masks. Concavities are easily carved out of it, whereas
+thin parts do not easily grow out of a sphere. Without masks the hull of the point cloud serves. It leaves the
+sky empty, which a sphere fills in front of the cameras.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.cloud_hull import find_cloud_hull
 from neilfpp_method.data.silhouettes import Outline, read_outlines
 from neilfpp_method.data.visual_hull import DistanceCube, find_hull
 from neilfpp_method.fields.sdf import SdfField
@@ -24,7 +26,7 @@ from neilfpp_method.settings.types import NeilfConfig
 __all__ = ["GeometryStart", "fit_distance", "start_geometry"]
 
 HULL_VIEWS = 64
-"""Maximum number of masks that the visual hull is computed from, evenly spaced over the views."""
+"""Maximum number of masks or cameras that a hull is computed from, evenly spaced over the views."""
 STEPS = 300
 """Optimizer steps of the fit to the hull."""
 POINTS = 2048
@@ -49,14 +51,14 @@ class GeometryStart:
     """The initial shape of the distance field.
 
     Attributes:
-        views: number of masks that the hull was computed from.
+        shape: the hull in a few words; empty if the field starts as a sphere.
         error: mean absolute difference between the fitted field and the hull's distance at the hull's
             surface, in scene units; None if the field starts as a sphere.
         reason: why the field starts as a sphere.
-        warning: whether the capture has masks that give no usable hull.
+        warning: whether the capture has masks or points that give no usable hull.
     """
 
-    views: int = 0
+    shape: str = ""
     error: float | None = None
     reason: str = ""
     warning: bool = False
@@ -66,14 +68,14 @@ class GeometryStart:
         """One line for the console."""
         if self.error is None:
             return f"{'warning: ' * self.warning}geometry starts as a sphere: {self.reason}"
-        return f"geometry starts as the visual hull of {self.views} masks, to {self.error:.3f} scene units"
+        return f"geometry starts as {self.shape}, to {self.error:.3f} scene units"
 
 
 def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> GeometryStart | None:
     """Initialise the distance field of a new model as `config.host.sdf.start` requests.
 
-    Only training views are read. The result depends on nothing but `config.train.seed` and the masks, and
-    the global random state is left unchanged.
+    Only training views are read. The result depends on nothing but `config.train.seed`, the masks, and the
+    points that supervise the geometry; the global random state is left unchanged.
 
     Returns:
         The initial shape; None if the host has no distance field to initialise (a mesh or a borrowed host).
@@ -85,15 +87,20 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
         return None
     if config.host.sdf.start == "sphere":
         return GeometryStart(reason="as the settings say")
-    outlines = [_in_scene(outline, capture) for outline in read_outlines(capture.train_views, HULL_VIEWS)]
-    if not outlines:
-        return GeometryStart(reason="the capture has no masks")
-    hull = find_hull(outlines)
+    views, points = capture.train_views, model.host.points
+    outlines = [_in_scene(outline, capture) for outline in read_outlines(views, HULL_VIEWS)]
+    shape, hull = "", "the capture has no masks, and no points supervise the geometry"
+    if outlines:
+        shape, hull = f"the visual hull of {len(outlines)} masks", find_hull(outlines)
+    if isinstance(hull, str) and points is not None:
+        cameras = [capture.scene_camera(view) for view in views[:: -(-len(views) // HULL_VIEWS)]]
+        shape = f"the hull of {len(points.position)} points"
+        hull = find_cloud_hull(points, cameras, config.volume.radius)
     if isinstance(hull, str):
-        return GeometryStart(reason=hull, warning=True)
+        return GeometryStart(reason=hull, warning=bool(outlines) or points is not None)
     error = fit_distance(model.host.sdf_field, hull, config.volume.radius, config.train.seed, _rate(config))
     model.host.starts_from_shape = True
-    return GeometryStart(len(outlines), error)
+    return GeometryStart(shape, error)
 
 
 def fit_distance(
@@ -117,7 +124,7 @@ def fit_distance(
     device = next(field.parameters()).device
     # A generator of its own keeps the random numbers of training independent of the initial shape.
     points = torch.Generator().manual_seed(seed)
-    surface = _surface_points(target, points)
+    surface = _surface_points(target, radius, points)
     optimizer = torch.optim.Adam(field.parameters(), lr=rate, eps=DAMPING, fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / STEPS))
     for _ in range(STEPS):
@@ -135,13 +142,14 @@ def fit_distance(
         return float((field(surface.to(device)).cpu() - target.at(surface)).abs().mean())
 
 
-def _surface_points(target: DistanceCube, generator: torch.Generator) -> Float[Tensor, "P 3"]:
-    """Random points of the cube within two grid cells of the surface."""
+def _surface_points(target: DistanceCube, radius: float, generator: torch.Generator) -> Float[Tensor, "P 3"]:
+    """Random points of the cube that lie in the ball and within two grid cells of the surface."""
     x = target.radius * (2 * torch.rand(POOL, 3, generator=generator) - 1)
+    x = x[x.norm(dim=-1) < radius]
     distance = target.at(x).abs()
     two_cells = torch.tensor(4 * target.radius / len(target.distance))
     # If the hull is very small, few points lie that near: then the nearest hundredth of the points is taken.
-    return x[distance <= torch.maximum(two_cells, distance.kthvalue(POOL // 100)[0])]
+    return x[distance <= torch.maximum(two_cells, distance.kthvalue(len(x) // 100)[0])]
 
 
 def _in_ball(count: int, radius: float, generator: torch.Generator) -> Float[Tensor, "N 3"]:

@@ -118,16 +118,10 @@ def test_too_few_points_decide_nothing(tmp_path):
     capture = load_capture(make_capture(tmp_path / "sphere"))
     pixels = PixelDataset(capture, capture.train_views)
     sphere = build_model(capture, scene_facts(capture, pixels, tiny_config()), tiny_config()).host
-    cloud_behind = dataclasses.replace(_cloud(sphere), position=_cloud(sphere).position + 100.0)
+    cloud_behind = dataclasses.replace(sphere.points, position=sphere.points.position + 100.0)
     found = measure_exposures(pixels, cloud_behind)
     assert found.measured.favours(chosen=False) is None
     assert not found.log_gain.any()
-
-
-def _cloud(host: VolSdfHost):
-    from neilfpp_method.structures import OrientedPoints
-
-    return OrientedPoints(host.point_position, host.point_normal)
 
 
 def exposed_model(response: str, log_gains: torch.Tensor, start: torch.Tensor | None = None) -> NeilfModel:

@@ -1,4 +1,4 @@
-"""The initial distance field: the visual hull of the masks, or a sphere with the reason."""
+"""The initial distance field: the hull of the masks or of the points, or a sphere with the reason."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.cloud_hull import find_cloud_hull
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.visual_hull import find_hull
@@ -37,6 +38,7 @@ SIZE = (64, 48)
 def cheap(monkeypatch) -> None:
     """A coarser hull and a shorter fit, sufficient for tiny fields."""
     monkeypatch.setattr(start, "find_hull", functools.partial(find_hull, resolution=40))
+    monkeypatch.setattr(start, "find_cloud_hull", functools.partial(find_cloud_hull, resolution=40))
     monkeypatch.setattr(start, "STEPS", 100)
     monkeypatch.setattr(start, "POINTS", 512)
     monkeypatch.setattr(start, "POOL", 8192)
@@ -48,7 +50,7 @@ def masked(tmp_path: Path) -> Path:
     return make_capture(tmp_path / "capture", views=12, size=SIZE, masks=True)
 
 
-def settings(begin: str = "silhouettes") -> NeilfConfig:
+def settings(begin: str = "hull") -> NeilfConfig:
     config = small_config()
     return dataclasses.replace(
         config, host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, start=begin))
@@ -107,9 +109,9 @@ def test_the_start_depends_on_the_seed_and_keeps_the_random_state(masked):
 
 
 @pytest.mark.parametrize(("shape", "share", "waiting"), [
-    ("silhouettes", 0.0, {"geometry", "beta"}),
-    ("silhouettes", 0.09, {"geometry", "beta"}),
-    ("silhouettes", 0.1, set()),
+    ("hull", 0.0, {"geometry", "beta"}),
+    ("hull", 0.09, {"geometry", "beta"}),
+    ("hull", 0.1, set()),
     ("sphere", 0.0, set()),
 ])  # fmt: skip
 def test_geometry_waits_for_radiance_if_it_starts_from_the_hull(masked, shape, share, waiting):
@@ -120,7 +122,15 @@ def test_geometry_waits_for_radiance_if_it_starts_from_the_hull(masked, shape, s
     assert waiting_fields(model, optimizer, StagePosition(Stage.JOINT, 0, 100)) == set()
     resumed = VolSdfHost(model.config, model.facts)
     resumed.load_state_dict(model.host.state_dict())
-    assert resumed.starts_from_shape == (shape == "silhouettes"), "a resumed run must wait as well"
+    assert resumed.starts_from_shape == (shape == "hull"), "a resumed run must wait as well"
+
+
+def test_the_background_need_not_wait_if_it_starts_from_the_hull(masked):
+    for shape, waits in (("hull", False), ("sphere", True)):
+        model, _ = started(masked, settings(shape))
+        optimizer = dataclasses.replace(model.config.optimizer, background_from=0.5)
+        waiting = waiting_fields(model, optimizer, StagePosition(Stage.SDF_INIT, 0, 100))
+        assert ("background" in waiting) == waits
 
 
 def test_masks_of_test_views_are_not_used(masked):
@@ -130,19 +140,31 @@ def test_masks_of_test_views_are_not_used(masked):
     assert all(torch.equal(a, b) for a, b in zip(weights(first), weights(again), strict=True))
 
 
-def test_without_masks_it_is_a_sphere_with_a_message(tmp_path):
+def without_points(config: NeilfConfig) -> NeilfConfig:
+    return dataclasses.replace(config, loss=dataclasses.replace(config.loss, point_cloud=0.0))
+
+
+def test_without_masks_it_is_the_hull_of_the_points(tmp_path):
+    model, told = started(make_capture(tmp_path, views=12, size=SIZE), settings())
+    assert told.text.startswith("geometry starts as the hull of 500 points, to 0.0")
+    assert off_the_ball(model).abs().mean() < 0.1
+    assert model.host.starts_from_shape
+
+
+def test_without_masks_and_points_it_is_a_sphere_with_a_message(tmp_path):
     root = make_capture(tmp_path, views=4)
-    plain, _ = started(root, settings("sphere"))
-    model, told = started(root, settings())
-    assert told == GeometryStart(reason="the capture has no masks")
+    plain, _ = started(root, without_points(settings("sphere")))
+    model, told = started(root, without_points(settings()))
+    reason = "the capture has no masks, and no points supervise the geometry"
+    assert told == GeometryStart(reason=reason)
     assert all(torch.equal(a, b) for a, b in zip(weights(plain), weights(model), strict=True))
 
 
 def test_masks_without_a_hull_are_a_warning(masked):
     for path in sorted((masked / "inputs" / "masks").iterdir()):
         write_png(path, np.full(SIZE[::-1], 255, np.uint8))
-    plain, _ = started(masked, settings("sphere"))
-    model, told = started(masked, settings())
+    plain, _ = started(masked, without_points(settings("sphere")))
+    model, told = started(masked, without_points(settings()))
     assert (
         told.text
         == "warning: geometry starts as a sphere: the masks show something that extends beyond the scene box"
