@@ -38,7 +38,7 @@ between the points of an object and find the table behind it: the objects of `ta
 TOLERANCE = 1.5
 """Smallest distance in front of a point at which space is empty, in cells."""
 MARGIN = 2
-"""Width of the shell around the ball that still belongs to the shape, in cells, so that the cut is outside."""
+"""Cells by which the shape extends beyond the ball, so that the cut is outside."""
 MIN_HIDDEN_SHARE = 0.5
 """Smallest share of the views with a cell in the image from which points must hide it."""
 MAX_EMPTY_SHARE = 0.2

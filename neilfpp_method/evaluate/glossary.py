@@ -58,7 +58,7 @@ def _ratio(title: str) -> Entry:
     return Entry(title, "%.2f", "lower", meaning)
 
 
-SCALED_IMAGES = "After the best factor per view and channel, because the exposure of a new view is unknown."
+SCALED_IMAGES = "After the median factor per view and channel, because the exposure of a new view is unknown."
 SCALED_LIGHT = "The same after the best factor per channel."
 
 ENTRIES: Mapping[str, Entry] = {

@@ -72,8 +72,9 @@ def exposed_alike(
 ) -> Float[np.ndarray, "H W 3"]:
     """Scale an estimate to the exposure of an image.
 
-    The exposure of a new view cannot be known from training. The factor per channel is that of least squares
-    over masked pixels that are not clipped, in linear values.
+    The exposure of a new view cannot be known from training. The factor per channel is the median ratio of
+    the linear values, over masked pixels that are not clipped. A least-squares factor would depend on a few
+    highlights that are a hundred times brighter than the image.
 
     Args:
         estimate: rendered linear radiance.
@@ -89,7 +90,7 @@ def exposed_alike(
     if response == "srgb":
         unclipped = pixels.max(-1) < CLIPPED
         pixels = srgb_to_linear(torch.from_numpy(pixels)).numpy()
-    gain = metrics.align_scale(estimate[mask][unclipped], pixels[unclipped])
+    gain = metrics.median_scale(estimate[mask][unclipped], pixels[unclipped])
     return (estimate * gain).astype(np.float32)
 
 

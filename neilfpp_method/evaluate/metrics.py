@@ -24,6 +24,7 @@ __all__ = [
     "confidence_ratio",
     "log_error",
     "log_ratio",
+    "median_scale",
     "psnr",
     "psnr_frame",
     "sample_surface",
@@ -145,6 +146,14 @@ def align_scale(
     e, t = estimate.astype(np.float64), truth.astype(np.float64)
     energy = (e * e).sum(0)
     return np.divide((e * t).sum(0), energy, out=np.ones_like(energy), where=energy > 0)
+
+
+def median_scale(
+    estimate: Float[np.ndarray, "P C"], truth: Float[np.ndarray, "P C"]
+) -> Float[np.ndarray, " C"]:
+    """The median ratio of truth to estimate per channel, over estimates above zero; 1 if there is none."""
+    ratios = [t[e > 0] / e[e > 0] for e, t in zip(estimate.T, truth.T, strict=True)]
+    return np.array([np.median(ratio) if len(ratio) else 1.0 for ratio in ratios])
 
 
 # --------------------------------------------------------------------------------------------------- geometry

@@ -6,7 +6,7 @@ figure without it.
 
     volume_psnr, pbr_psnr, *_ssim     images from R, and from the rendering equation; clipped, sRGB-encoded
     *_psnr_linear                     the same on linear radiance, peak 1; HDR captures
-    *_psnr_exposed                    after the least-squares gain per view and channel; captures whose
+    *_psnr_exposed                    after the median gain per view and channel; captures whose
                                       training views have gains
     base_color_psnr, _gamma, _scaled  as estimated; after one gamma; after a least-squares factor per channel
     roughness_psnr, metallic_psnr     as estimated

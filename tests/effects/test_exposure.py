@@ -193,5 +193,7 @@ def test_a_new_view_is_compared_at_its_own_exposure(response):
     if response == "srgb":
         image = linear_to_srgb(torch.from_numpy(image)).numpy()
         image[0] = 1.0  # clipped: does not determine the gain
+    estimate[1, :2] = 1e5  # a false highlight does not determine it either
     mask = np.ones((6, 5), bool)
     np.testing.assert_allclose(exposed_alike(estimate, image, mask, response), estimate * gain, rtol=1e-5)
+    assert np.array_equal(exposed_alike(estimate, image, mask & False, response), estimate)
