@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -51,6 +51,15 @@ class BestMaterials:
     roughness: Int[Tensor, " P"]
     metallic: Int[Tensor, " P"]
     loss: Float[Tensor, " P"]
+
+    def where(self, keep: Bool[Tensor, " P"], other: BestMaterials) -> BestMaterials:
+        """These materials at the places to keep, and the other ones elsewhere."""
+        return BestMaterials(
+            torch.where(keep[:, None], self.base_color, other.base_color),
+            torch.where(keep, self.roughness, other.roughness),
+            torch.where(keep, self.metallic, other.metallic),
+            torch.where(keep, self.loss, other.loss),
+        )
 
 
 def on_grid(
@@ -107,10 +116,9 @@ def best_materials(
         near: indices of the neighbours of each place, including itself (`neighbors`).
     """
     diffuse, unit = arriving[0], places.observed.pixel + FLOOR * typical
-    lowest = torch.full((places.count,), torch.inf, device=unit.device)
+    first = torch.zeros(places.count, dtype=torch.long, device=unit.device)
     base_color = torch.full((places.count, 3), MIN_BASE_COLOR, device=unit.device)
-    roughness = torch.zeros(places.count, dtype=torch.long, device=unit.device)
-    metallic = torch.zeros_like(roughness)
+    best = BestMaterials(base_color, first, first, torch.full_like(base_color[:, 0], torch.inf))
     for k in range(len(ROUGHNESSES)):
         facing, grazing = arriving[1 + 2 * k], arriving[2 + 2 * k]
         for j, m in enumerate(metallics):
@@ -124,11 +132,9 @@ def best_materials(
                 error = candidate[places.place] * slope - target
                 weight = 1 / error.abs().clamp_min(OUTLIER)
             loss = mean_loss(error, places, near)
-            better = loss < lowest
-            lowest = torch.where(better, loss, lowest)
-            base_color = torch.where(better[:, None], candidate, base_color)
-            roughness, metallic = torch.where(better, k, roughness), torch.where(better, j, metallic)
-    return BestMaterials(base_color, roughness, metallic, lowest)
+            numbers = torch.full_like(best.roughness, k), torch.full_like(best.roughness, j)
+            best = best.where(~(loss < best.loss), BestMaterials(candidate, *numbers, loss))
+    return best
 
 
 def mean_loss(error: Float[Tensor, "N 3"], places: Places, near: Int[Tensor, "P M"]) -> Float[Tensor, " P"]:

@@ -5,6 +5,9 @@ than at both ends. Under the light of a half-trained model it is easy to see whi
 views better, so every roughness and metallic of a grid is tried at some thousand places. The BRDF field is
 then trained to be paint where paint is better, and to keep its values everywhere else.
 
+A rough metal reflects almost like matte paint, which is far more common. It also becomes paint if a metal is
+only slightly better than paint. On photographs of a castle, half of the surface was rough metal otherwise.
+
 The opposite change is not made: of 18 places of two scenes at which a search found metal in place of paint,
 one was metal, whereas 87 % of the changes to paint were right.
 """
@@ -78,6 +81,12 @@ MIN_ROUGHNESS = 0.05
 """Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
 MIN_BASE_COLOR = 0.02
 """Base colours are raised to at least this value before their logarithms are compared."""
+MATTE_ROUGHNESS = 0.65
+"""Roughness from which metal becomes paint even if another metal would be slightly better."""
+MATTE_RATIO = 1.1
+"""Largest error of that paint as a multiple of the error of the best material. At the end of training on
+recovered geometry of `spot_city`, 17 of 18 such places were paint.
+"""
 STEPS = 150
 """Training steps of the field."""
 BATCH = 4096
@@ -139,11 +148,15 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
     loss = _loss_of(current, arriving, places, typical, near)
     best = best_materials(arriving, places, typical, METALLICS, near)
-    found = on_grid(best.base_color, best.roughness, best.metallic)
-    is_other = (current.metallic - found.metallic)[:, 0] >= MIN_CHANGE
-    is_judged = (current.roughness[:, 0] >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
-    is_better = is_other & is_judged & (best.loss < MAX_RATIO * loss)
-    material = _where(is_better[place], found[place], model.brdf(places.observed.position))
+    paint = best_materials(arriving, places, typical, METALLICS[:1], near)
+    roughness = current.roughness[:, 0]
+    is_matte = (roughness >= MATTE_ROUGHNESS) & (paint.loss < MATTE_RATIO * best.loss)
+    found = best.where(~is_matte, paint)
+    material = on_grid(found.base_color, found.roughness, found.metallic)
+    is_other = (current.metallic - material.metallic)[:, 0] >= MIN_CHANGE
+    is_judged = (roughness >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
+    is_better = is_other & is_judged & (found.loss < MAX_RATIO * loss)
+    material = _where(is_better[place], material[place], model.brdf(places.observed.position))
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
 
 

@@ -84,6 +84,25 @@ def test_paint_does_not_become_metal():
     assert search_materials(trained_to(PAINT, metal), metal).share == 0
 
 
+def matte(base_color: float, metallic: float, roughness: float = 0.9) -> Material:
+    return Material(*(torch.full((1, n), v) for n, v in ((3, base_color), (1, roughness), (1, metallic))))
+
+
+def test_matte_paint_that_was_learned_as_rough_metal_becomes_paint():
+    one = torch.ones(COUNT, 1)
+    stone = ball(0.3 * one.expand(-1, 3), 0.9 * one, 0 * one, LOBE, VIEWS, fine_sky())
+    searched = search_materials(trained_to(matte(0.4, 0.8), stone), stone)
+    assert searched.share > 0.8
+    assert searched.material.metallic.median() == 0
+
+
+def test_rough_metal_is_kept():
+    """The field is not exact, so that its error does not decide alone."""
+    one = torch.ones(COUNT, 1)
+    iron = ball(0.6 * one.expand(-1, 3), 0.75 * one, one, LOBE, VIEWS, fine_sky())
+    assert search_materials(trained_to(matte(0.52, 0.9, 0.8), iron), iron).share < 0.2
+
+
 def due_after(model: NeilfModel, length: int) -> list[int]:
     """The numbers of steps of material init after which a search is due."""
     positions = [StagePosition(Stage.MATERIAL_INIT, n, length) for n in range(1, length + 1)]
