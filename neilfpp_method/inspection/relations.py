@@ -82,7 +82,11 @@ def _lattice() -> Float64[np.ndarray, "S 3"]:
 
 
 def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) -> Float64[np.ndarray, " V"]:
-    """Return the brightness of each view relative to the median of the views that are nearest in pose.
+    """Return the brightness of each view relative to the views that are nearest in pose.
+
+    It is compared with the median of `NEIGHBORS` views and with the mean of the nearest two, and the factor
+    closer to 1 counts. The median ignores single views that jump, but may belong to the other side of an
+    object with a bright and a dark one; the nearest two see the same side.
 
     The distance of two poses combines, with equal weights, the distance of the camera centres, divided by
     their median distance from the centre of the scene, and the distance of the unit viewing directions.
@@ -103,7 +107,8 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
         others = np.flatnonzero(nonzero & (np.arange(len(light)) != i))
         if len(others):
             nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBORS]]
-            factors[i] = light[i] / np.median(light[nearest])
+            usual = np.array([np.median(light[nearest]), np.exp(np.log(light[nearest[:2]]).mean())])
+            factors[i] = min(light[i] / usual, key=lambda factor: abs(np.log(factor)))
     return factors
 
 

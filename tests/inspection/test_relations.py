@@ -38,6 +38,17 @@ def test_a_jump_is_distinguished_from_a_slow_change() -> None:
         assert np.allclose(np.delete(factors, i), 1, atol=0.15), "its neighbours stay out of it"
 
 
+def test_an_object_with_a_bright_and_a_dark_side_has_no_jump() -> None:
+    """A view between the sides has two bright and four dark neighbours, like view 021 of `spot_paint`."""
+    angle = np.radians([0, 10, 15, 80, 90, 100, 110])
+    outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(7)], axis=1)
+    placement = replace(ring(7), centers=3 * outward, axes=-outward)
+    light = np.where(np.arange(7) < 3, 0.5, 0.27)
+    assert np.allclose(exposure_factors(light.tolist(), placement), 1, atol=0.01)
+    light[0] *= 2
+    assert exposure_factors(light.tolist(), placement)[0] == pytest.approx(2)
+
+
 def test_black_views_and_single_views_have_no_factor() -> None:
     assert exposure_factors([2.0], ring(1)).tolist() == [1]
     assert exposure_factors([2.0, 0.0, 2.0, 2.0], ring(4)).tolist() == [1, 1, 1, 1]
