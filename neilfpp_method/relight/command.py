@@ -39,6 +39,7 @@ from neilfpp_method.relight.picture_folder import PictureFolder
 from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
+from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_folder
@@ -224,6 +225,7 @@ def _lights(request: RelightRequest, run: Run, say: Callable[[str], None]) -> di
 def _settings(request: RelightRequest, run: Run, name: str) -> dict[str, Any]:
     """All settings that affect an image, as values for JSON."""
     path = dict(zip(map_names(request.env), request.env, strict=True)).get(name)
+    weights = checkpoint_path(run.path, request.checkpoint)
     settings = {
         "format": FORMAT,
         "map": OWN if path is None else path.name,
@@ -232,6 +234,7 @@ def _settings(request: RelightRequest, run: Run, name: str) -> dict[str, Any]:
         "lamps": _with_lamps(request),
         "lamp": list(request.lamp_edits),
         "step": run.step,
+        "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
         "set": list(request.edits),
         "box": None if request.box is None else list(request.box),
         "mask": [[path.name, hashlib.sha256(path.read_bytes()).hexdigest()] for path in request.mask],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from neilfpp_method.commands.command import Command
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.relight import command
 from neilfpp_method.relight.lamplight import Lamplight
+from neilfpp_method.train.checkpoint import last_checkpoint
 from tests.calls import train_tiny
 from tests.train.small_runs import few_steps, solved_light
 
@@ -157,6 +159,22 @@ def test_another_map_with_the_same_name_is_detected(given, sky, tmp_path, capfd)
     said = capfd.readouterr().err
     assert "another map of this name" in said
     assert "sha256" not in said
+
+
+def test_images_of_another_run_are_not_taken_for_its_own(given, sky, tmp_path, capfd):
+    options = ("--env", sky, "--width", 6, "--out", tmp_path / "out")
+    assert relit(given, *options) == 0
+    shutil.copytree(given, tmp_path / "other")
+    weights = last_checkpoint(tmp_path / "other")
+    saved = torch.load(weights, weights_only=True)
+    saved["model"] = {
+        name: value + 1 if name.startswith("brdf") else value for name, value in saved["model"].items()
+    }
+    torch.save(saved, weights)
+    capfd.readouterr()
+    assert relit(tmp_path / "other", *options) == 2
+    assert "the weights of another training" in capfd.readouterr().err
+    assert relit(tmp_path / "other", *options, "--force") == 0
 
 
 def test_an_edit_changes_the_image(given, sky, tmp_path):
