@@ -24,7 +24,7 @@ import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 
@@ -82,7 +82,7 @@ class CaptureSource:
 
     root: str
     test_every: int | None = None
-    response: str = "auto"
+    response: Literal["auto", "linear", "srgb"] = "auto"
     format: str | None = None
     scale: float = 1.0
 

@@ -213,6 +213,7 @@ def change(path: Path, **values) -> None:
         ("config.json", {"config": None}, "not a complete description"),
         ("config.json", {"config": {"brdf": 3}}, "config.brdf: 3 where settings belong"),
         ("capture.json", {"drive": "B:"}, r"capture\.json: unknown setting 'drive'"),
+        ("capture.json", {"response": "log"}, r"capture\.json\.response: 'log' is not a choice"),
         ("scene.json", {"moon": 1}, r"scene\.json: unknown setting 'moon'"),
     ],
 )
