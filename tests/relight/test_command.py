@@ -182,9 +182,11 @@ def test_an_edit_changes_the_image(given, sky, tmp_path):
         assert relit(given, "--env", sky, "--out", tmp_path / name, *options) == 0
         return read_image(tmp_path / name / "studio" / "000.exr").pixels.mean((0, 1))
 
+    # The ball has its centre at (0.3, −0.2, 0.5) and the radius 1.2; the box meets its lowest point only.
+    beside_it = (0.2, -0.3, -0.75, 0.4, -0.1, -0.69)
     red = mean("red", "--set", "base_color=0.9,0.05,0.05", "--set", "roughness=1")
     black = mean("black", "--set", "base_color=0", "--set", "roughness=1", "--set", "metallic=1")
-    beside = mean("beside", "--set", "base_color=0", "--set", "metallic=1", "--box", 90, 90, 90, 91, 91, 91)
+    beside = mean("beside", "--set", "base_color=0", "--set", "metallic=1", "--box", *beside_it)
     assert red[0] / red[2] > 6
     assert black.max() < 0.2 * red[0]
     assert beside.min() > 2 * black.max()
@@ -297,7 +299,12 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--views", "nobody"], ("--views nobody", "no view of this name", "000")),
         (["--views", "turntable", "000"], ("--views turntable",)),
         (["--checkpoint", "sdf_init"], ("no material",)),
+        (
+            ["--set", "metallic=1", "--box", "90", "90", "90", "91", "91", "91"],
+            ("--box contains no part of the surface", "world frame"),
+        ),
         (["--rotate", "nan"], ("--rotate",)),
+        (["--exposure", "2000"], ("--exposure is 2000", "64 stops")),
     ],
 )
 def test_invalid_options_are_refused_before_anything_is_written(found, capfd, options, words):
