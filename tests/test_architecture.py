@@ -37,6 +37,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("demo", "plugin", "prepare", "tradeoff"),
     ("commands",),
     ("cli",),
+    ("__main__",),
 )
 # Packages that are stricter than their layer. Data is read and prepared without networks,
 # settings included.

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from neilfpp_method.__main__ import main as start
 from neilfpp_method.cli import main
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.data.images import replacing
@@ -26,6 +27,21 @@ def command(monkeypatch: pytest.MonkeyPatch, run: Callable[[object], None]) -> l
     """The words of a command that runs this function."""
     monkeypatch.setitem(COMMANDS, "inspect", replace(COMMANDS["inspect"], options=Nothing, run=run))
     return ["inspect"]
+
+
+class Interrupted:
+    """Presses Ctrl-C when the module of the command line is imported."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "neilfpp_method.cli":
+            raise KeyboardInterrupt
+
+
+def test_ctrl_c_while_modules_are_imported(monkeypatch, capfd):
+    monkeypatch.delitem(sys.modules, "neilfpp_method.cli")
+    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
+    assert start() == 130
+    assert capfd.readouterr().err == "stopped\n"
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -44,6 +44,8 @@ def mistake(complaint: str, arguments: Sequence[str]) -> Mistake:
         complaint: the box that tyro prints; its paragraphs are separated by rules.
         arguments: the words of the command line.
     """
+    if "│" not in complaint:
+        complaint = _boxed(complaint) or complaint
     boxed = [line.strip("│ ") for line in complaint.splitlines() if line.startswith("│")]
     lines = boxed or complaint.splitlines()
     paragraphs: list[list[str]] = [[]]
@@ -56,6 +58,15 @@ def mistake(complaint: str, arguments: Sequence[str]) -> Mistake:
     if what.startswith(TYRO_MISSING):
         return Mistake(_missing(complaint) or what, None)
     return Mistake(what, _flag_with_a_value(what, arguments) or _suggested(what, paragraphs))
+
+
+def _boxed(complaint: str) -> str:
+    """The same with the signs of a box, which tyro leaves out if standard output is not UTF-8.
+
+    Its title and a rule come first, and rules are of hyphens.
+    """
+    body = complaint.splitlines()[2:]
+    return "\n".join("│" + (line.replace("-", "─") if not line.strip("- ") else line)[1:] for line in body)
 
 
 def _missing(complaint: str) -> str:

@@ -99,11 +99,16 @@ def check_camera(camera: Camera, where: str) -> None:
         )
     if min(camera.width, camera.height) < 1:
         raise UserError(f"{where}: the image size is not positive", "give width and height in pixels")
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3 and np.linalg.det(rotation) > 0
-    if not rigid or not np.allclose(camera.w2c[3], [0, 0, 0, 1]):
+    orthogonal = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    if not orthogonal or not np.allclose(camera.w2c[3], [0, 0, 0, 1]):
         raise UserError(
             f"{where}: the extrinsic matrix is not a rotation and a translation",
             "give world-to-camera, 4×4, row-major",
+        )
+    if np.linalg.det(rotation) < 0:
+        raise UserError(
+            f"{where}: the pose mirrors the scene (determinant −1)",
+            "negate one axis of the camera: x points right, y down and z forward (OpenGL: y up and z back)",
         )
     if camera.lens is not None:
         camera.lens.check(where)

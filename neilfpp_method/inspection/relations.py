@@ -19,6 +19,10 @@ NEIGHBORS = 6
 """Number of views, nearest in pose, with which a view is compared."""
 THUMBNAIL = (32, 32)
 """Width and height of the thumbnails that are compared, in pixels."""
+NEAR = 0.85
+"""Distance of two poses beyond which they are not compared: about 35° around the centre. Views farther apart
+may show a bright and a dark side of the object.
+"""
 SAME = 0.02
 """Root mean square difference of standardised thumbnails below which two views are duplicates."""
 LIT = 0.99
@@ -92,7 +96,7 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
         placement: the cameras of the views.
 
     Returns:
-        A factor per view; 1 if its luminance, or that of all other views, is unknown.
+        A factor per view; 1 if its luminance is unknown, or if no view of known luminance is near.
     """
     light = np.array(luminances)
     scale = max(float(np.median(np.linalg.norm(placement.centers, axis=1))), 1e-9)
@@ -100,10 +104,10 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
     nonzero = light > 0
     factors = np.ones(len(light))
     for i in np.flatnonzero(nonzero):
-        others = np.flatnonzero(nonzero & (np.arange(len(light)) != i))
-        if len(others):
-            nearest = others[np.argsort(np.linalg.norm(pose[others] - pose[i], axis=1))[:NEIGHBORS]]
-            factors[i] = light[i] / np.median(light[nearest])
+        distance = np.linalg.norm(pose - pose[i], axis=1)
+        near = np.flatnonzero(nonzero & (distance < NEAR) & (np.arange(len(light)) != i))
+        if len(near):
+            factors[i] = light[i] / np.median(light[near[np.argsort(distance[near])[:NEIGHBORS]]])
     return factors
 
 

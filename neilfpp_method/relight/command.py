@@ -39,6 +39,7 @@ from neilfpp_method.relight.picture_folder import PictureFolder
 from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
+from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_folder
@@ -52,6 +53,8 @@ TURNTABLE = "turntable"
 """The word for a circle of cameras in place of views."""
 SAMPLES = 64
 """Default number of samples per pixel, if neither --spp nor --seconds is given."""
+MAX_EXPOSURE = 64
+"""Largest change of the exposure, in stops; float32 holds 254."""
 MAX_BOUNCES = 64
 """Largest number of bounces, after which a path carries less than a thousandth of its radiance."""
 FORMAT = 1
@@ -124,6 +127,10 @@ def relight(
     }
     if any(missing.values()):
         surface = surface_of_run(run, request.resolution)
+        if box and not box.may_meet(surface.triangles):
+            raise UserError(
+                "--box contains no part of the surface", "give two corners in the world frame of the capture"
+            )
         limits = ([box.contains] if box else []) + ([masked_limit(stencils, surface)] if stencils else [])
         materials = with_edits(run.model.materials, parse_edits(request.edits), limits)
         scenes = {name: Scene(surface, materials, run.model.lobe, sky, lamps) for name, sky in lights.items()}
@@ -157,8 +164,12 @@ def _check(request: RelightRequest) -> None:
             f"--bounces is {request.bounces}",
             f"give at most {MAX_BOUNCES}, after which less than a thousandth of the light is left",
         )
-    if not all(np.isfinite(value) for value in (request.rotate, request.exposure)):
-        raise UserError("--rotate or --exposure is not finite", "give degrees and stops")
+    if not np.isfinite(request.rotate):
+        raise UserError(f"--rotate is {request.rotate}", "give degrees")
+    if not abs(request.exposure) <= MAX_EXPOSURE:
+        raise UserError(
+            f"--exposure is {request.exposure}", f"give between −{MAX_EXPOSURE} and {MAX_EXPOSURE} stops"
+        )
     if request.scale is not None and request.width is not None:
         raise UserError("--scale and --width both set the size of views", "give only one of them")
     for option, given in (("--box", request.box is not None), ("--mask", bool(request.mask))):
@@ -224,6 +235,7 @@ def _lights(request: RelightRequest, run: Run, say: Callable[[str], None]) -> di
 def _settings(request: RelightRequest, run: Run, name: str) -> dict[str, Any]:
     """All settings that affect an image, as values for JSON."""
     path = dict(zip(map_names(request.env), request.env, strict=True)).get(name)
+    weights = checkpoint_path(run.path, request.checkpoint)
     settings = {
         "format": FORMAT,
         "map": OWN if path is None else path.name,
@@ -232,6 +244,7 @@ def _settings(request: RelightRequest, run: Run, name: str) -> dict[str, Any]:
         "lamps": _with_lamps(request),
         "lamp": list(request.lamp_edits),
         "step": run.step,
+        "weights_sha256": hashlib.sha256(weights.read_bytes()).hexdigest(),
         "set": list(request.edits),
         "box": None if request.box is None else list(request.box),
         "mask": [[path.name, hashlib.sha256(path.read_bytes()).hexdigest()] for path in request.mask],

@@ -43,6 +43,11 @@ class Box:
         """Whether points lie in the box."""
         return ((x >= self.low.to(x)) & (x <= self.high.to(x))).all(-1, keepdim=True)
 
+    def may_meet(self, triangles: Float[Tensor, "F 3 3"]) -> bool:
+        """Whether the bounding box of any triangle meets the box."""
+        low, high = triangles.amin(1), triangles.amax(1)
+        return bool(((high >= self.low.to(low)) & (low <= self.high.to(low))).all(-1).any())
+
 
 def parse_edits(texts: Sequence[str]) -> list[Edit]:
     """Parse edits of the form name=value, with a number in [0, 1], or r,g,b for a linear colour.

@@ -21,6 +21,9 @@ from neilfpp_method.train.json_files import read_json, write_json
 
 __all__ = ["PictureFolder", "StoredPicture"]
 
+OTHER = {"map_sha256": "another map of this name", "weights_sha256": "the weights of another training"}
+"""What differs if a setting does whose values tell the user nothing."""
+
 
 @dataclass(frozen=True)
 class StoredPicture:
@@ -53,11 +56,7 @@ class PictureFolder:
         stored = read_json(record)
         for key, value in self._record(shot).items():
             if stored.get(key) != value:
-                other = (
-                    "another map of this name"
-                    if key == "map_sha256"
-                    else f"{key} {stored.get(key)}, not {value}"
-                )
+                other = OTHER.get(key, f"{key} {stored.get(key)}, not {value}")
                 problem = f"{record}: the image was rendered with {other}"
                 raise UserError(problem, "choose another --out, or render again with --force")
         return all(self._file(shot, suffix).is_file() for suffix in (".exr", ".png"))

@@ -118,7 +118,8 @@ def check_same(row: Row) -> None:
     plan = read_budget(row.out)
     planned = row.config if plan is None else planned_settings(plan, row.config)
     effects = str(read_plan(row.out, described.config).request)
-    source = CaptureSource(str(row.data.resolve()), scale=described.source.scale)
+    kept = described.source
+    source = CaptureSource(str(row.data.resolve()), scale=kept.scale, unit=kept.unit, center=kept.center)
     wanted = _compared(planned, source, row.budget, str(parse_effects(row.effects)))
     stored = _compared(described.config, described.source, plan and plan.budget, effects)
     for name in dict.fromkeys((*stored, *wanted)):

@@ -137,7 +137,9 @@ def plan_run(
         planned_effects(budget, plan)
     rays = training_rays(plan.config.train, request.processes)
     scale = scale_for_rays(capture.train_views, rays) if request.scale is None else request.scale
-    return OpenRun(out, plan, replace(source, scale=scale), at_scale(capture, scale), None, budget)
+    frame = capture.normalization
+    source = replace(source, scale=scale, unit=frame.scale, center=frame.center)
+    return OpenRun(out, plan, source, at_scale(capture, scale), None, budget)
 
 
 def training_rays(config: TrainConfig, processes: int) -> int:
@@ -148,12 +150,13 @@ def training_rays(config: TrainConfig, processes: int) -> int:
 def _check_unchanged(request: TrainingRequest, out: Path, described: Description) -> None:
     """Raise a `UserError` if the capture or the settings of a request differ from those of the run."""
     source = described.source
-    requested = CaptureSource(
-        source.root if request.data is None else str(request.data.resolve()),
-        source.test_every if request.test_every is None else request.test_every,
-        source.response if request.response == "auto" else request.response,
-        request.format or source.format,
-        source.scale if request.scale is None else request.scale,
+    requested = replace(
+        source,
+        root=source.root if request.data is None else str(request.data.resolve()),
+        test_every=source.test_every if request.test_every is None else request.test_every,
+        response=source.response if request.response == "auto" else request.response,
+        format=request.format or source.format,
+        scale=source.scale if request.scale is None else request.scale,
     )
     if requested != source or request.config not in (None, described.config):
         raise UserError(

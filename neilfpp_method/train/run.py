@@ -22,13 +22,13 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 
-from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.capture import Capture, Normalization, load_capture
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
@@ -78,19 +78,25 @@ class CaptureSource:
         response: "linear", "srgb", or "auto" for what the files say.
         format: format of the capture; None to recognise it from the files.
         scale: size of the images relative to their files.
+        unit: length of a scene unit in the world frame, which the run keeps if the scene box of the capture
+            changes later; None for that of the capture.
+        center: origin of the scene frame in the world frame; None together with `unit`.
     """
 
     root: str
     test_every: int | None = None
-    response: str = "auto"
+    response: Literal["auto", "linear", "srgb"] = "auto"
     format: str | None = None
     scale: float = 1.0
+    unit: float | None = None
+    center: tuple[float, float, float] | None = None
 
     def load(self) -> Capture:
-        """Load the capture, with views of `scale` times the size of their files."""
-        return at_scale(
-            load_capture(Path(self.root), self.format, self.test_every, response=self.response), self.scale
-        )
+        """Load the capture, with views of `scale` times the size of their files, in the run's scene frame."""
+        capture = load_capture(Path(self.root), self.format, self.test_every, response=self.response)
+        if self.unit is not None and self.center is not None:
+            capture = replace(capture, normalization=Normalization(self.unit, self.center))
+        return at_scale(capture, self.scale)
 
     def load_again(self, run: Path) -> Capture:
         """Load the capture of an existing run.

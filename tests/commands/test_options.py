@@ -94,6 +94,27 @@ def test_an_output_of_another_encoding(tmp_path, encoding):
     assert process.stderr == b""
 
 
+@pytest.mark.parametrize("encoding", ["ascii", "UTF-8"])
+def test_mistakes_are_one_line_in_any_encoding(encoding):
+    """Tyro draws its boxes without their signs if the output is not called utf-8, in small letters."""
+    said = []
+    for arguments in (["eval"], ["eval", "run", "--protocl", "dtu"]):
+        process = subprocess.run(
+            [sys.executable, "-m", "neilfpp_method.cli", *arguments],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "PYTHONIOENCODING": encoding},
+            timeout=60,
+            check=False,
+        )
+        said.append(process.stderr)
+    assert said == [
+        "error: missing: PATH (The run folder); see neilfpp eval --help\n",
+        "error: Unrecognized options: --protocl, dtu; did you mean --protocol? Otherwise see neilfpp eval "
+        "--help\n",
+    ]
+
+
 def test_a_real_process_says_one_line_and_no_more(tmp_path):
     """No warning of a library before it, no traceback after it."""
     command = [sys.executable, "-m", "neilfpp_method.cli", "train", "--data", str(tmp_path / "nowhere")]

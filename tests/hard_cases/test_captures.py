@@ -93,7 +93,7 @@ BROKEN_SCENES = {
     "ragged extrinsic": (extrinsic([[1, 0], [0]]), "extrinsic: not 16 or 4×4 finite numbers"),
     "extrinsic of text": (extrinsic("eye"), "extrinsic: not 16 or 4×4 finite numbers"),
     "extrinsic with NaN": (extrinsic([float("nan")] * 16), "extrinsic: not 16 or 4×4 finite numbers"),
-    "mirror": (extrinsic(MIRROR), "003.exr: the extrinsic matrix is not a rotation and a translation"),
+    "mirror": (extrinsic(MIRROR), "003.exr: the pose mirrors the scene (determinant −1)"),
     "scaled rotation": (extrinsic(np.diag([2, 2, 2, 1]).tolist()), "the extrinsic matrix is not a rotation"),
     "projective": (extrinsic([*np.eye(4)[:3].tolist(), [0, 0, 1, 0]]), "extrinsic matrix is not a rotation"),
     "negative focal": (intrinsic(focal=[-25.0, 25.0]), "003.exr: the focal length is not positive"),

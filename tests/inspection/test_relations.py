@@ -38,9 +38,21 @@ def test_a_jump_is_distinguished_from_a_slow_change() -> None:
         assert np.allclose(np.delete(factors, i), 1, atol=0.15), "its neighbours stay out of it"
 
 
+def test_an_object_with_a_bright_and_a_dark_side_has_no_jump() -> None:
+    """A view has three bright neighbours and farther dark ones, like view 021 of `spot_paint`."""
+    angle = np.radians([0, 10, 20, 30, 50, 60, 70, 80])
+    outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(8)], axis=1)
+    placement = replace(ring(8), centers=3 * outward, axes=-outward)
+    light = np.where(np.arange(8) < 4, 0.5, 0.27)
+    assert exposure_factors(light.tolist(), placement)[0] == pytest.approx(1)
+    light[0] *= 2
+    assert exposure_factors(light.tolist(), placement)[0] == pytest.approx(2)
+    assert exposure_factors([1.0, 0.4, 1.0], ring(3)).tolist() == [1, 1, 1], "120° apart"
+
+
 def test_black_views_and_single_views_have_no_factor() -> None:
     assert exposure_factors([2.0], ring(1)).tolist() == [1]
-    assert exposure_factors([2.0, 0.0, 2.0, 2.0], ring(4)).tolist() == [1, 1, 1, 1]
+    assert exposure_factors([2.0, 0.0, *[2.0] * 14], ring(16)).tolist() == [1] * 16
 
 
 def test_duplicates_survive_compression_size_and_brightness() -> None:

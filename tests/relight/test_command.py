@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import resource
+import shutil
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from neilfpp_method.commands.command import Command
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.relight import command
 from neilfpp_method.relight.lamplight import Lamplight
+from neilfpp_method.train.checkpoint import last_checkpoint
 from tests.calls import train_tiny
 from tests.train.small_runs import few_steps, solved_light
 
@@ -159,14 +161,32 @@ def test_another_map_with_the_same_name_is_detected(given, sky, tmp_path, capfd)
     assert "sha256" not in said
 
 
+def test_images_of_another_run_are_not_taken_for_its_own(given, sky, tmp_path, capfd):
+    options = ("--env", sky, "--width", 6, "--out", tmp_path / "out")
+    assert relit(given, *options) == 0
+    shutil.copytree(given, tmp_path / "other")
+    weights = last_checkpoint(tmp_path / "other")
+    saved = torch.load(weights, weights_only=True)
+    saved["model"] = {
+        name: value + 1 if name.startswith("brdf") else value for name, value in saved["model"].items()
+    }
+    torch.save(saved, weights)
+    capfd.readouterr()
+    assert relit(tmp_path / "other", *options) == 2
+    assert "the weights of another training" in capfd.readouterr().err
+    assert relit(tmp_path / "other", *options, "--force") == 0
+
+
 def test_an_edit_changes_the_image(given, sky, tmp_path):
     def mean(name: str, *options: object) -> np.ndarray:
         assert relit(given, "--env", sky, "--out", tmp_path / name, *options) == 0
         return read_image(tmp_path / name / "studio" / "000.exr").pixels.mean((0, 1))
 
+    # The ball has its centre at (0.3, −0.2, 0.5) and the radius 1.2; the box meets its lowest point only.
+    beside_it = (0.2, -0.3, -0.75, 0.4, -0.1, -0.69)
     red = mean("red", "--set", "base_color=0.9,0.05,0.05", "--set", "roughness=1")
     black = mean("black", "--set", "base_color=0", "--set", "roughness=1", "--set", "metallic=1")
-    beside = mean("beside", "--set", "base_color=0", "--set", "metallic=1", "--box", 90, 90, 90, 91, 91, 91)
+    beside = mean("beside", "--set", "base_color=0", "--set", "metallic=1", "--box", *beside_it)
     assert red[0] / red[2] > 6
     assert black.max() < 0.2 * red[0]
     assert beside.min() > 2 * black.max()
@@ -279,7 +299,12 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--views", "nobody"], ("--views nobody", "no view of this name", "000")),
         (["--views", "turntable", "000"], ("--views turntable",)),
         (["--checkpoint", "sdf_init"], ("no material",)),
+        (
+            ["--set", "metallic=1", "--box", "90", "90", "90", "91", "91", "91"],
+            ("--box contains no part of the surface", "world frame"),
+        ),
         (["--rotate", "nan"], ("--rotate",)),
+        (["--exposure", "2000"], ("--exposure is 2000", "64 stops")),
     ],
 )
 def test_invalid_options_are_refused_before_anything_is_written(found, capfd, options, words):

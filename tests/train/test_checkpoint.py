@@ -12,15 +12,20 @@ from importlib import metadata
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint, save_checkpoint
 from neilfpp_method.train.run import FORMAT, CaptureSource, check_free, create_run, load_run, read_description
+from tests.calls import train_tiny
+from tests.data.make_capture import make_capture
 from tests.scenes import tiny_config
+from tests.train.small_runs import few_steps
 
 FACTS = SceneFacts("linear", 0.25, 3.0, "constant", (0.5, 0.25, 0.125))
 
@@ -156,6 +161,16 @@ def test_a_description_is_read_back(tmp_path):
     assert run.facts == FACTS
 
 
+def test_a_run_keeps_its_scene_frame(tmp_path):
+    """Fields are functions of the scene frame; masks or points that are added later may change the box."""
+    root = make_capture(tmp_path / "capture")
+    run = train_tiny(root, tmp_path / "run", config=few_steps)
+    before = load_capture(root).normalization
+    change(root / "inputs" / "sfm_scene.json", bbox={"transform": np.diag([9.0, 9, 9, 1]).tolist()})
+    assert load_capture(root).normalization != before
+    assert load_run(run).capture.normalization == before
+
+
 def test_a_run_is_not_created_in_a_folder_with_other_files(tmp_path):
     (tmp_path / "empty").mkdir()
     check_free(tmp_path / "empty")
@@ -213,6 +228,7 @@ def change(path: Path, **values) -> None:
         ("config.json", {"config": None}, "not a complete description"),
         ("config.json", {"config": {"brdf": 3}}, "config.brdf: 3 where settings belong"),
         ("capture.json", {"drive": "B:"}, r"capture\.json: unknown setting 'drive'"),
+        ("capture.json", {"response": "log"}, r"capture\.json\.response: 'log' is not a choice"),
         ("scene.json", {"moon": 1}, r"scene\.json: unknown setting 'moon'"),
     ],
 )

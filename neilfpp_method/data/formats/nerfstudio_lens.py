@@ -8,9 +8,11 @@ from neilfpp_method.data.lens import Lens, lens_of
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 
-__all__ = ["FISHEYE", "lens_from_nerfstudio", "nerfstudio_coefficients"]
+__all__ = ["COEFFICIENTS", "FISHEYE", "lens_from_nerfstudio", "nerfstudio_coefficients"]
 
 FISHEYE = "OPENCV_FISHEYE"
+COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+"""Coefficients that a transforms.json may have."""
 NAMES = {
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
@@ -30,14 +32,16 @@ def lens_from_nerfstudio(model: str, coefficients: Mapping[str, float], where: s
         where: the camera, for the message.
 
     Raises:
-        UserError: a perspective camera has a k4. In nerfstudio it multiplies r⁸, which no model of COLMAP
-            has.
+        UserError: a coefficient has no counterpart in COLMAP. The k4 of nerfstudio's perspective camera
+            multiplies r⁸, which no model of COLMAP has; k5 and k6 have no meaning in nerfstudio.
     """
-    known = {name: coefficients.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2")}
-    if model != FISHEYE and known["k4"]:
-        raise UserError(
-            f"{where}: k4 is supported for {FISHEYE} only", "undistort the images, or calibrate without it"
-        )
+    known = {name: coefficients.get(name, 0.0) for name in COEFFICIENTS}
+    for name in ("k5", "k6") if model == FISHEYE else ("k4", "k5", "k6"):
+        if known[name]:
+            raise UserError(
+                f"{where}: {name} is not supported for the camera model {model}",
+                "undistort the images, or calibrate without it",
+            )
     if model != FISHEYE:
         model = "FULL_OPENCV" if known["k3"] else "OPENCV"
     unnamed = (0.0,) * 3 if model == "FULL_OPENCV" else ()

@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from neilfpp_method.data.capture_folder import read_scene
-from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, lens_from_nerfstudio
+from neilfpp_method.data.formats.nerfstudio_lens import COEFFICIENTS, FISHEYE, lens_from_nerfstudio
 from neilfpp_method.data.formats.places import stored, stored_image, view_names
 from neilfpp_method.data.images import image_header
 from neilfpp_method.data.json_entry import Entry
@@ -142,9 +142,7 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
     width, height = width.size() if width else header.width, height.size() if height else header.height
     fx, fy = _focal_lengths(entry, frame, width, height)
     cx, cy = number("cx"), number("cy")
-    distortion = {
-        name: value for name in ("k1", "k2", "k3", "k4", "p1", "p2") if (value := number(name)) is not None
-    }
+    distortion = {name: value for name in COEFFICIENTS if (value := number(name)) is not None}
     model, fisheye = (frame.get(name) or entry.get(name) for name in ("camera_model", "is_fisheye"))
     unnamed = FISHEYE if fisheye and fisheye.value is True else "OPENCV"
     return Camera(

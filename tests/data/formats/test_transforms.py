@@ -267,7 +267,7 @@ def frame(content: dict) -> dict:
         ),
         (
             lambda c: frame(c).update(transform_matrix=np.diag([-1.0, 1, 1, 1]).tolist()),
-            ["002.exr: the extrinsic matrix is not"],
+            ["002.exr: the pose mirrors the scene", "negate one axis"],
         ),
         (lambda c: c.pop("fl_x"), ["frames.0: no focal length"]),
         (lambda c: c.update(fl_x=-3), ["the focal length is not positive"]),
@@ -276,7 +276,12 @@ def frame(content: dict) -> dict:
         (lambda c: c.update(w=1e400), ["w: not a finite number"]),
         (lambda c: c.update(w=48), ["24×18 pixels where the camera has 48×18"]),
         (lambda c: c.update(camera_model="EQUIRECTANGULAR"), ["camera_model: not OPENCV or"]),
-        (lambda c: c.update(k4=0.1), ["k4 is supported for OPENCV_FISHEYE only"]),
+        (lambda c: c.update(k4=0.1), ["k4 is not supported for the camera model OPENCV"]),
+        (lambda c: c.update(k6=0.1), ["k6 is not supported for the camera model OPENCV"]),
+        (
+            lambda c: c.update(k5=0.1, camera_model="OPENCV_FISHEYE"),
+            ["k5 is not supported for the camera model OPENCV_FISHEYE"],
+        ),
         (lambda c: c["frames"].append(frame(c)), ["have the same name"]),
     ],
 )
