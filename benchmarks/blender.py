@@ -41,7 +41,7 @@ from neilfpp_method.relight.sky import sky_of_run
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.run import Run, load_run
 
-__all__ = ["blender_picture", "shown_psnr"]
+__all__ = ["Shot", "blender_picture", "shown_psnr"]
 
 BOUNCES = 6
 TEXTURE_SIZE, FACES, ERROR = 2048, 30_000, 0.001
@@ -68,22 +68,24 @@ class Options:
     """Folder for the asset and Blender's images; default: they are not kept."""
 
 
-def blender_picture(
-    python: Path,
-    asset: Path,
-    camera: str,
-    out: Path,
-    source: Literal["glb", "usd"] = "glb",
-    percent: int = 100,
-    samples: int = 128,
-) -> Float[np.ndarray, "H W 3"]:
+@dataclass(frozen=True)
+class Shot:
+    """An image that Blender renders: the name of a camera, the file that it opens, size and samples."""
+
+    camera: str
+    source: Literal["glb", "usd"] = "glb"
+    percent: int = 100
+    samples: int = 128
+
+
+def blender_picture(python: Path, asset: Path, shot: Shot, out: Path) -> Float[np.ndarray, "H W 3"]:
     """Linear radiance rendered by Cycles with the script of the asset; the map is visible behind the surface.
 
     Raises:
         UserError: that Python has no bpy, or the script fails.
     """
-    words = [python, asset / "open_in_blender.py", "--camera", camera, "--render", out, "--source", source]
-    words += ["--percent", percent, "--samples", samples]
+    words = [python, asset / "open_in_blender.py", "--camera", shot.camera, "--render", out]
+    words += ["--source", shot.source, "--percent", shot.percent, "--samples", shot.samples]
     done = subprocess.run(
         [str(word) for word in words], capture_output=True, text=True, timeout=MAX_SECONDS, check=False
     )
@@ -130,7 +132,9 @@ def compare(options: Options, folder: Path, console: Console) -> None:
         if not (asset / f"asset.{source}{'a' if source == 'usd' else ''}").is_file():
             continue
         out = folder / f"{name}-{source}.exr"
-        theirs = blender_picture(options.python, asset, name, out, source, options.percent, options.samples)
+        theirs = blender_picture(
+            options.python, asset, Shot(name, source, options.percent, options.samples), out
+        )
         share = theirs[within].mean(0) / radiance[within].mean(0)
         channels = ", ".join(f"{factor:.3f}" for factor in share)
         console.print(

@@ -27,7 +27,7 @@ from jaxtyping import Float
 from rich.console import Console
 from scipy import ndimage
 
-from benchmarks.mitsuba_scene import Lamp, Part, load_mitsuba, render
+from benchmarks.mitsuba_scene import Lamp, LitScene, Part, PathSampling, load_mitsuba, render
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.views import Camera
@@ -202,14 +202,13 @@ def write_capture(mi, scene: KnownScene, root: Path, views: int, size: tuple[int
     rows = np.array(
         [[*p.base_color, 1.0 if p.roughness is None else p.roughness, p.metallic] for p in scene.parts]
     )
+    lit = LitScene(scene.parts, scene.radiance, scene.lamps)
     tracks, files, test = {}, {}, []
     for i in range(views):
         elevation = math.radians(scene.elevations[i % 2])
         camera, name = camera_at(2 * math.pi * i / views, elevation, width, height), f"{i:03d}"
         with tempfile.TemporaryDirectory() as folder:
-            picture = render(
-                mi, scene.parts, scene.radiance, camera, Path(folder), samples, BOUNCES, i, scene.lamps
-            )
+            picture = render(mi, lit, camera, PathSampling(samples, BOUNCES, seed=i), Path(folder))
         seen = look(mesh, part_of_face, camera)
         write_exr(inputs / "images" / f"{name}.exr", {"RGB": picture.astype(np.float32)})
         write_exr(inputs / "depth_maps" / f"{name}.exr", {"Y": seen.depth.astype(np.float32)})

@@ -27,7 +27,7 @@ from rich.console import Console
 from torch import Tensor
 
 from benchmarks.measure import hardware
-from benchmarks.mitsuba_scene import Part, load_mitsuba, render
+from benchmarks.mitsuba_scene import LitScene, Part, PathSampling, load_mitsuba, render
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.film import Budget, render_picture
@@ -129,8 +129,9 @@ def agreement(variant: str, width: int, spp: int, reference_spp: int, bounces: i
     seconds = time.perf_counter() - begun
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
+        lit = LitScene(parts, radiance.numpy())
         theirs = [
-            render(mi, parts, radiance.numpy(), camera, Path(folder), reference_spp, bounces, seed)
+            render(mi, lit, camera, PathSampling(reference_spp, bounces, seed), Path(folder))
             for seed in (1, 2)
         ]
         seconds_of_mitsuba = (time.perf_counter() - begun) / 2
