@@ -244,7 +244,7 @@ class NeilfModel(nn.Module):
         """The material of surface points, and its active priors L_smth and L_Lam."""
         priors = {}
         if "smoothness" in active:
-            with timed("regularisers"):
+            with timed("regularizers"):
                 sample = self.brdf.with_gradients(surface.position)
             material = sample.material
             priors["smoothness"] = losses.smoothness(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
+from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.views import RenderedView, render_view
 from neilfpp_method.train.run import Run
@@ -56,7 +56,7 @@ def render_run(
     names = view_names(run.capture, views)
     if confidence and not run.has_material:
         raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
-    evidence = gather_evidence(run) if confidence else None
+    residuals = measure_residuals(run) if confidence else None
     written = []
     for i, view in enumerate(run.capture.views):
         if view.name not in names:
@@ -70,7 +70,7 @@ def render_run(
             rendered = render_view(
                 run, i, lambda share, done=done: on_progress((done + RENDERING * share) / len(names))
             )
-            _write(rendered if evidence is None else with_deviation(run, evidence, rendered), out)
+            _write(rendered if residuals is None else with_deviation(run, residuals, rendered), out)
         on_progress(len(written) / len(names))
     return written
 

@@ -153,7 +153,7 @@ def _check_quality(run: Training, position: StagePosition, step: int) -> None:
         run.quality.check_when_due(run.model, position, step, run.ledger.total)
 
 
-@timed("optimiser")
+@timed("optimizer")
 def _update(
     run: Training, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, moment: Moment
 ) -> bool:
