@@ -21,8 +21,9 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.measure import Measurement, hardware
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 
 __all__ = ["SUITES", "compare", "merged"]
 

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.report.write import REPORT, write_report
@@ -36,7 +37,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint, load_checkpoint, save_checkpoint
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import create_run, load_run, read_description

@@ -25,8 +25,8 @@ from pathlib import Path
 
 import tyro
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.json_files import write_json
 
 __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "write_result"]
 

@@ -24,7 +24,7 @@ from neilfpp_method.incident import (
     scene_tracer,
     trace_light,
 )
-from neilfpp_method.lighting.replay import Replay
+from neilfpp_method.lighting.replay import PointReplay
 from neilfpp_method.lighting.solver import LightSolver, make_light_solver
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, StageTable, active_losses
 from neilfpp_method.settings.check import check_config
@@ -111,7 +111,7 @@ class NeilfModel(nn.Module):
         self.use(config)
         # The trainer of a borrowed host may move its surface in any step, so no point is reused.
         surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
-        self.replay = Replay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
+        self.replay = PointReplay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
         """Switch to other settings. Effects may change; the sizes of the fields must not."""

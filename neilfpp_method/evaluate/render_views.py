@@ -53,7 +53,7 @@ def render_run(
     Raises:
         UserError: the capture has no such view, or `confidence` is set and the run has no material yet.
     """
-    names = view_names(run.capture, views)
+    names = chosen_views(run.capture, views)
     if confidence and not run.has_material:
         raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
     residuals = measure_residuals(run) if confidence else None
@@ -75,7 +75,7 @@ def render_run(
     return written
 
 
-def view_names(capture: Capture, views: str | Collection[str]) -> frozenset[str]:
+def chosen_views(capture: Capture, views: str | Collection[str]) -> frozenset[str]:
     """Resolve "test", "train", "all" or names of views to a set of names.
 
     Raises:

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from neilfpp_method.fields.environment import EVEN_ROWS, EnvironmentLight
 from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, compare, evidence
+from neilfpp_method.lighting.candidates import merge_lamps, propose
+from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, error_reduction, evidence
 from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
@@ -86,7 +86,7 @@ def solve_light(
     else:
         found = start.fit(target, objective)
     unknown.copy_(found.log_radiance)
-    merged = merge(places, found.intensity, from_candidates.sources[0].mean(0), len(lamps.position))
+    merged = merge_lamps(places, found.intensity, from_candidates.sources[0].mean(0), len(lamps.position))
     map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
     merged = settle_lamps(merged, lamps.radius, map_light, points, objective)
     # The map was fitted together with the candidates, so it must be fitted again with the refined lamps.
@@ -144,7 +144,7 @@ def _compare_at_held_back_points(
         plain = map_only[fitted].fit(target[fitted], objective)
         found = with_lamps[fitted].fit(target[fitted], objective)
         lights = (map_only[held_back].with_light(plain), with_lamps[held_back].with_light(found))
-        gains.append(compare(*lights, target[held_back], objective))
+        gains.append(error_reduction(*lights, target[held_back], objective))
     return _Compared(plain, found, evidence(torch.cat(gains)))
 
 

@@ -34,7 +34,7 @@ from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
+from neilfpp_method.plugin.datamanager import PIXELS, VALID, to_pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
@@ -281,7 +281,7 @@ class NeilfMethod(Model):
         """The weighted losses of the stage; in evaluation mode the mean absolute error of the image."""
         if not self.training:
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
-        pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
+        pixels = to_pixel_batch(outputs["origins"], outputs["directions"], batch)
         computed = self.neilf.step(pixels, self.stage)
         terms = computed.terms
         self.computed = computed

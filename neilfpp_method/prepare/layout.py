@@ -30,7 +30,7 @@ from neilfpp_method.prepare.sparse_cloud import SparsePoints, oriented, reliable
 from neilfpp_method.prepare.steps import Step, begin
 from neilfpp_method.prepare.summary import Placement, Summary, write_summary
 
-__all__ = ["WORK", "Source", "lay_out"]
+__all__ = ["WORK", "PoseSource", "lay_out"]
 
 WORK = "work"
 """Folder inside the capture's folder in which the steps keep their results."""
@@ -49,7 +49,7 @@ WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
 
 
 @dataclass(frozen=True)
-class Source:
+class PoseSource:
     """Posed views from which a capture is made, and where the poses come from.
 
     Attributes:
@@ -79,7 +79,7 @@ class _Cloud:
     source: str
 
 
-def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
+def lay_out(source: PoseSource, options: Prepare, open_bar: Bars) -> Summary | None:
     """Write the folder of the capture with its summary.
 
     Returns:
@@ -118,7 +118,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     return summary
 
 
-def _write_posed_views(source: Source, options: Prepare, step: Step, open_bar: Bars) -> None:
+def _write_posed_views(source: PoseSource, options: Prepare, step: Step, open_bar: Bars) -> None:
     """Write the views with their scene box as a capture in the folder of a step, and complete the step."""
     posed, points = source.posed, None
     if source.points is not None and len(source.points):
@@ -134,7 +134,7 @@ def _write_posed_views(source: Source, options: Prepare, step: Step, open_bar: B
     step.complete({})
 
 
-def _cloud(source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> _Cloud:
+def _cloud(source: PoseSource, prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> _Cloud:
     """The oriented points of the capture, from the best source that the options allow."""
     if options.cloud == "dense" or (options.cloud == "auto" and source.posed.cloud is None):
         try:
@@ -165,7 +165,7 @@ def _dense(prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> 
 
 
 def _publish(
-    source: Source, prepared: Capture, cloud: _Cloud, problems: tuple[str, ...], options: Prepare
+    source: PoseSource, prepared: Capture, cloud: _Cloud, problems: tuple[str, ...], options: Prepare
 ) -> Summary:
     """Write the folder of the capture; `capture.json` is removed first and written last."""
     out = options.out

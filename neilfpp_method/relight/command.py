@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -40,7 +41,6 @@ from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_folder
 from neilfpp_method.train.run import Run, load_run
 

@@ -52,7 +52,7 @@ from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
 from neilfpp_method.train.quality import Quality, has_checks
-from neilfpp_method.train.reading import load_pixels
+from neilfpp_method.train.reading import load_training_pixels
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import PIXELS, create_run
 from neilfpp_method.train.start import start_geometry
@@ -136,7 +136,7 @@ class _Prepared:
 
 def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
     """Read the pixels, build the model, and create the folder of a new run."""
-    pixels = load_pixels(run.capture, run.out / PIXELS, fabric, console)
+    pixels = load_training_pixels(run.capture, run.out / PIXELS, fabric, console)
     facts = _measure_facts(run, pixels) if run.facts is None else run.facts
     record_facts(run.plan, facts)
     config = run.plan.config_of_model

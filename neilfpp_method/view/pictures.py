@@ -17,7 +17,7 @@ from neilfpp_method.relight.cameras import rays_through, resized
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths
 from neilfpp_method.relight.sequence import Sequence
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.view.pace import Pace, sizes
+from neilfpp_method.view.pace import RenderSpeed, sizes
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
 __all__ = ["Frame", "PictureRequest", "frames"]
@@ -76,7 +76,7 @@ Shader = Callable[[RayBatch, Tensor], Tensor]
 """Maps rays and their pixel indices to RGB and opacity, (N, 4)."""
 
 
-def frames(request: PictureRequest, pace: Pace) -> Iterator[Frame | None]:
+def frames(request: PictureRequest, pace: RenderSpeed) -> Iterator[Frame | None]:
     """Yield successively finer images of a request, and None between batches, when rendering may stop.
 
     Args:
@@ -98,7 +98,7 @@ def frames(request: PictureRequest, pace: Pace) -> Iterator[Frame | None]:
 
 
 def _render(
-    request: PictureRequest, camera: Camera, shader: Shader, pace: Pace, jitter: int
+    request: PictureRequest, camera: Camera, shader: Shader, pace: RenderSpeed, jitter: int
 ) -> Iterator[Tensor | None]:
     """Yield None after each batch but the last, then the values of all pixels.
 

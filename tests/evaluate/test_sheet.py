@@ -19,7 +19,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.panels import albedo_scale, view_sections
 from neilfpp_method.evaluate.pictures import display
-from neilfpp_method.evaluate.render_views import render_run, view_names
+from neilfpp_method.evaluate.render_views import chosen_views, render_run
 from neilfpp_method.evaluate.sheet import write_contact_sheet, write_light_picture
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_test_views, render_view
 from neilfpp_method.fields.lamps import Lamps
@@ -223,8 +223,8 @@ def test_rendered_files_hold_the_values_and_rendering_continues(root: Path, tmp_
 
 def test_views_are_selected_by_group_or_by_name(root: Path):
     capture = load_capture(root)
-    assert view_names(capture, "train") == {"001", "003"}
-    assert view_names(capture, "all") == {"000", "001", "002", "003"}
-    assert view_names(capture, "003") == {"003"}
+    assert chosen_views(capture, "train") == {"001", "003"}
+    assert chosen_views(capture, "all") == {"000", "001", "002", "003"}
+    assert chosen_views(capture, "003") == {"003"}
     with pytest.raises(UserError, match="no view '9'"):
-        view_names(capture, ["000", "9"])
+        chosen_views(capture, ["000", "9"])

@@ -14,13 +14,13 @@ import pytest
 from neilfpp_method.tradeoff.command import table
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.files import write_tradeoff
-from neilfpp_method.tradeoff.frontier import Measured, frontier
+from neilfpp_method.tradeoff.frontier import RunResult, frontier
 
 
-def runs_of(*figures: tuple[float, float, float], seed: int = 0) -> list[Measured]:
+def runs_of(*figures: tuple[float, float, float], seed: int = 0) -> list[RunResult]:
     """Runs of one seed: seconds, dB of base colour, degrees of normals."""
     return [
-        Measured(seconds, seed, seconds, {"base_color_psnr_scaled": decibels, "normal_mae_deg": degrees})
+        RunResult(seconds, seed, seconds, {"base_color_psnr_scaled": decibels, "normal_mae_deg": degrees})
         for seconds, decibels, degrees in figures
     ]
 
@@ -51,7 +51,10 @@ def test_seeds_have_a_mean_and_a_deviation():
 
 
 def test_only_figures_that_all_runs_have_are_compared():
-    runs = [Measured(60.0, 0, 60.0, {"held_back_psnr": 20.0, "pbr_psnr": 1.0}), *runs_of((120.0, 20.0, 10.0))]
+    runs = [
+        RunResult(60.0, 0, 60.0, {"held_back_psnr": 20.0, "pbr_psnr": 1.0}),
+        *runs_of((120.0, 20.0, 10.0)),
+    ]
     assert frontier(runs)[0].figures == {}
     assert not any(point.dominated for point in frontier(runs))
     assert frontier([]) == []

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.export.asset.surface import Surface, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, first_hits, meet_along
 from neilfpp_method.export.asset.tangents import vertex_tangents
 from neilfpp_method.export.asset.texels import covered_texels, dilate
 from neilfpp_method.export.mesh import materials_in_parts
@@ -58,7 +58,7 @@ class Textures:
 class Detail:
     """What the textures show: the fine surface, and its largest distance from the coarse one, scene units."""
 
-    surface: Surface
+    surface: AssetSurface
     reach: float
 
 
