@@ -39,7 +39,7 @@ from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
+from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, learning_rate, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -192,9 +192,7 @@ class AttachedNeilf(nn.Module):
         """
         rates = self.model.config.optimizer
         groups = self.parameter_groups().items()
-        return [
-            {"params": p, "lr": getattr(rates, name, rates.geometry), "name": name} for name, p in groups if p
-        ]
+        return [{"params": p, "lr": learning_rate(rates, name), "name": name} for name, p in groups if p]
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field."""

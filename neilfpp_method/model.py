@@ -274,9 +274,7 @@ class NeilfModel(nn.Module):
     @timed("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
         """L_ref on random rays from surface points, at those that hit the scene."""
-        traced = trace_light(
-            self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share
-        )
+        traced = trace_light(self.host, position, normal, self.config)
         rows = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[rows], traced.wi[rows][:, None])[:, 0]
         return losses.inter_reflection(
@@ -295,7 +293,7 @@ class NeilfModel(nn.Module):
         """Traces light between surfaces of the scene; None unless inter-reflection is hard."""
         if self.config.inter_reflection.mode != "hard":
             return None
-        return scene_tracer(self.host, self.config.inter_reflection, self.config.shading.hit_share)
+        return scene_tracer(self.host, self.config.ray_offset, self.config.shading.hit_share)
 
     @property
     def sources(self) -> Sources:

@@ -36,6 +36,7 @@ __all__ = [
     "StageTable",
     "Total",
     "active_losses",
+    "learning_rate",
     "rate_factor",
     "stage_at",
     "stage_steps",
@@ -62,10 +63,11 @@ EXPOSURE_PRIOR = 0.1
 nearly undetermined: R, which depends on the direction, can compensate a gain that all pixels of a view share.
 """
 
-MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
-"""Losses of the material stages, with the settings that hold their weights relative to L_phys, whose weight
-is 1.
-"""
+INTER_REFLECTION = 0.1
+"""Weight of L_ref in the material stages, relative to L_phys, whose weight is 1 (published code)."""
+
+MATERIAL_LOSSES = {name: name for name in ("smoothness", "lambertian")}
+"""Priors of the material stages, with the settings that hold their weights."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +234,13 @@ def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
     return first * (config.beta_final / first) ** share
 
 
+def learning_rate(config: OptimizerConfig, field: str) -> float:
+    """Learning rate of a field before warm-up and decay. The background learns like R, and a field that the
+    settings do not name, such as one of another project's host, like the geometry.
+    """
+    return getattr(config, "radiance" if field == "background" else field, config.geometry)
+
+
 def active_losses(
     stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0
 ) -> Mapping[str, float]:
@@ -252,10 +261,10 @@ def active_losses(
     }
     if plan.moves_material:
         weights["physical"] = 1.0
+        if config.inter_reflection.mode == "soft":
+            weights["inter_reflection"] = INTER_REFLECTION
     if config.optimizer.exposure > 0 and "volume" in weights:
         weights["exposure"] = EXPOSURE_PRIOR
-    if config.inter_reflection.mode != "soft":
-        weights.pop("inter_reflection", None)
     if not config.shading.specular:
         # A Lambertian surface has neither roughness nor metallic, on which these losses act.
         for loss in ("smoothness", "lambertian"):

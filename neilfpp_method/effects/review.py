@@ -204,7 +204,7 @@ def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: in
     surface = rendered.observed
     decisions = []
     if plan.is_open("inter-reflection"):
-        measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
+        measured = self_visibility(model, plan.settings, surface.position, surface.normal)
         decisions.append(plan.decide("inter-reflection", measured, step))
     if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
         decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neilfpp_method.hosts.base import Host, LimitsSurfaceWidth, StartsFromShape
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, rate_factor, surface_width_limit
+from neilfpp_method.schedule import Stage, StagePosition, learning_rate, rate_factor, surface_width_limit
 from neilfpp_method.settings.types import OptimizerConfig, VolumeConfig
 
 __all__ = [
@@ -32,7 +32,7 @@ def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Op
     Frozen parameters are included; they receive no gradient and are not changed.
     """
     groups = [
-        {"params": parameters, "name": name, "lr": getattr(config, name)}
+        {"params": parameters, "name": name, "lr": learning_rate(config, name)}
         for name, parameters in model.parameter_groups().items()
         if parameters
     ]
@@ -65,7 +65,7 @@ def set_rates(
     factor = rate_factor(config, position)
     for group in optimizer.param_groups:
         name = group["name"]
-        group["lr"] = 0.0 if name in waiting else getattr(config, name) * factor
+        group["lr"] = 0.0 if name in waiting else learning_rate(config, name) * factor
 
 
 def waiting_fields(model: NeilfModel, config: OptimizerConfig, position: StagePosition) -> set[str]:
