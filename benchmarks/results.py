@@ -38,7 +38,7 @@ from neilfpp_method.train.build import build_model
 from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint, load_checkpoint, save_checkpoint
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.json_files import read_json
-from neilfpp_method.train.optimizer import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import Stream, make_optimizer, seed_stream
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import create_run, load_run, read_description
 
@@ -124,7 +124,7 @@ def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
     """Create a run at the end of SDF init with the host of the trunk, and an untrained material and light."""
     described = read_description(trunk)
     saved = load_checkpoint(checkpoint_path(trunk, "sdf_init"))
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     model = build_model(described.source.load(), described.facts, config)
     own = model.state_dict()
     shared = {

@@ -35,7 +35,14 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates, waiting_fields
+from neilfpp_method.train.optimizer import (
+    Stream,
+    make_optimizer,
+    seed_step,
+    seed_stream,
+    set_rates,
+    waiting_fields,
+)
 from neilfpp_method.train.run import Run
 
 __all__ = ["Curve", "Mark", "curve", "table"]
@@ -102,7 +109,7 @@ def curve(
     capture = load_capture(root)
     pixels = PixelDataset(capture, capture.train_views, device=device)
     facts = scene_facts(capture, pixels, config)
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     model = build_model(capture, facts, config).to(device)
     shown = dataclasses.replace(capture, test=frozenset(view.name for view in capture.test_views[:views]))
     steps = sum(stage_steps(config.train).values())

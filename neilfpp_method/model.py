@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -17,13 +18,7 @@ from neilfpp_method import losses
 from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
-from neilfpp_method.incident import (
-    Sources,
-    arriving,
-    incident_radiance,
-    scene_tracer,
-    trace_light,
-)
+from neilfpp_method.incident import Sources, arriving, incident_radiance, scene_tracer, trace_light
 from neilfpp_method.lighting.replay import PointReplay
 from neilfpp_method.lighting.solver import LightSolver, make_light_solver
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, StageTable, active_losses
@@ -119,6 +114,16 @@ class NeilfModel(nn.Module):
         self.lobe = _specular_lobe(config.shading)
         self.brdf.use(config.brdf)
         LightModel(self.light, self.lamps).use(config.light)
+
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """Evaluation mode within the context."""
+        mode = self.training
+        self.eval()
+        try:
+            yield
+        finally:
+            self.train(mode)
 
     # ----------------------------------------------------------------------------------------------- one step
 

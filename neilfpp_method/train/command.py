@@ -47,7 +47,7 @@ from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.mesh_fit import measure_mesh_fit
 from neilfpp_method.train.opening import OpenRun, open_run, plan_run, training_rays
-from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.optimizer import Stream, seed_stream
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
@@ -270,7 +270,7 @@ def _train(
 
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
-    seed_step(config.train.seed, step=-2)
+    seed_stream(config.train.seed, Stream.HEALTH)
     return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
 
 

@@ -113,10 +113,8 @@ class _Measured:
 
 @torch.no_grad()
 def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool, hdr: bool) -> _Measured:
-    mode = model.training
-    model.eval()
-    maps = model.maps(pixels.rays, with_material)
-    model.train(mode)
+    with model.evaluating():
+        maps = model.maps(pixels.rays, with_material)
     photograph = tone_map(pixels.color) if hdr else pixels.color
     physical = _psnr(tone_map(maps.rgb), photograph) if with_material else None
     return _Measured(_psnr(tone_map(maps.rgb_volume), photograph), physical)
