@@ -98,9 +98,8 @@ class NeilfModel(nn.Module):
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         # The light starts at the radiance under which the initial material has the images' median radiance.
-        albedo = initial_albedo(
-            config.brdf.initial_base_color, config.brdf.initial_metallic, _specular_lobe(config.shading)
-        )
+        first, lobe = config.brdf, _specular_lobe(config.shading)
+        albedo = initial_albedo(first.initial_base_color, first.initial_metallic, lobe)
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
@@ -231,12 +230,10 @@ class NeilfModel(nn.Module):
     @timed("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         """Surface points to shade; the gradients of position and normal are scaled by the settings."""
-        settings = self.config.loss
+        settings, normal = self.config.loss, self.shading_normals(hits.position, hits.normal)
         return SurfacePixels(
             position=losses.scale_gradient(hits.position, settings.position_gradient),
-            normal=losses.scale_gradient(
-                self.shading_normals(hits.position, hits.normal), settings.normal_gradient
-            ),
+            normal=losses.scale_gradient(normal, settings.normal_gradient),
             wo=-pixels.directions,
             pixel=pixels.color,
             image_gradient=pixels.image_gradient,

@@ -26,7 +26,7 @@ from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.relight.cameras import Shot, chosen_views, rays_through, turntable, view_shots
+from neilfpp_method.relight.cameras import Shot, pixel_rays, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import parse_edits, scene_box, with_edits
@@ -195,7 +195,7 @@ def _shots(request: RelightRequest, run: Run) -> list[Shot]:
     capture = run.capture
     if TURNTABLE in request.views:
         return turntable(capture, request.frames, request.scale, request.width)
-    views = chosen_views(capture, request.views)
+    views = capture.chosen_views(request.views)
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 
 
@@ -292,9 +292,8 @@ def _render(
 def _over_sky(picture: Picture, sky: Sky, shot: Shot) -> Picture:
     """Composite the image over the environment map."""
     height, width = picture.alpha.shape[:2]
-    pixel = torch.arange(height * width, device=picture.alpha.device)
-    rays, valid = rays_through(shot.camera, torch.stack((pixel % width, pixel // width), -1) + 0.5)
-    background = (sky.lookup(rays.directions) * valid[:, None]).view(height, width, 3)
+    seen = pixel_rays(shot.camera, torch.arange(height * width, device=picture.alpha.device))
+    background = (sky.lookup(seen.rays.directions) * seen.valid[:, None]).view(height, width, 3)
     radiance = picture.radiance + (1 - picture.alpha) * background
     return dataclasses.replace(picture, radiance=radiance, alpha=torch.ones_like(picture.alpha))
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.views import Camera
-from neilfpp_method.relight.cameras import rays_through
+from neilfpp_method.relight.cameras import pixel_rays
 from neilfpp_method.relight.path_tracer import DIMENSIONS, Scene, trace_paths
 from neilfpp_method.relight.sequence import Numbers, Sequence
 
@@ -108,8 +108,7 @@ def render_picture(
 def _samples(scene: Scene, camera: Camera, numbers: Numbers, bounces: int) -> Float[Tensor, "N 10"]:
     """Radiance, alpha, albedo and normal of one sample for each path."""
     paths = torch.arange(len(numbers.pixel), device=numbers.pixel.device)
-    corner = torch.stack((numbers.pixel % camera.width, numbers.pixel // camera.width), -1)
-    rays, valid = rays_through(camera, corner + numbers.at(paths, 0, PIXEL_DIMENSIONS))
-    traced = trace_paths(scene, rays, numbers, bounces, PIXEL_DIMENSIONS)
+    drawn = pixel_rays(camera, numbers.pixel, numbers.at(paths, 0, PIXEL_DIMENSIONS))
+    traced = trace_paths(scene, drawn.rays, numbers, bounces, PIXEL_DIMENSIONS)
     values = torch.cat((traced.radiance, traced.alpha[:, None], traced.albedo, traced.normal), -1)
-    return (values * valid[:, None]).double()
+    return (values * drawn.valid[:, None]).double()

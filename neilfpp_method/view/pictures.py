@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.evaluate.pictures import display, display_color
-from neilfpp_method.relight.cameras import rays_through, resized
+from neilfpp_method.relight.cameras import pixel_rays, resized
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths
 from neilfpp_method.relight.sequence import Sequence
 from neilfpp_method.structures import RayBatch
@@ -114,8 +114,7 @@ def _render(
     while start < len(pixels):
         rows = pixels[start : start + pace.batch(layer)]
         begun = time.perf_counter()
-        corner = torch.stack((rows % camera.width, rows // camera.width), -1)
-        rays, _ = rays_through(camera, corner + position)
+        rays = pixel_rays(camera, rows, position).rays
         # The copy to the CPU waits for the device, so that the measured time is that of the work.
         with torch.no_grad():
             done.append(shader(rays, rows).cpu())
@@ -196,7 +195,7 @@ def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:
     pixels = torch.arange(camera.width * camera.height, device=subject.device)
     depth = torch.full((len(pixels),), FAR, device=subject.device)
     if subject.surface is not None:
-        rays, _ = rays_through(camera, torch.stack((pixels % camera.width, pixels // camera.width), -1) + 0.5)
+        rays = pixel_rays(camera, pixels).rays
         hits = subject.surface.intersect(rays.origins, rays.directions)
         forward = torch.from_numpy(camera.w2c[2, :3].astype(np.float32)).to(subject.device)
         depth[hits.rows] = hits.distance * (rays.directions[hits.rows] @ forward)

@@ -241,10 +241,10 @@ def test_the_ratio_compares_the_half_with_smaller_expected_errors():
 
 
 def test_a_render_with_confidence_completes_one_without(run: Run, tmp_path: Path):
-    path = render_run(run, tmp_path, "test")[0]
+    path = render_run(run, tmp_path, ("test",))[0]
     picture = tmp_path / "metallic_std" / f"{path.stem}.png"
     assert not picture.exists()
-    render_run(run, tmp_path, "test", confidence=True)
+    render_run(run, tmp_path, ("test",), confidence=True)
     assert picture.exists()
     with pytest.raises(UserError, match="no material"):
-        render_run(replace(run, step=0), tmp_path, "test", confidence=True)
+        render_run(replace(run, step=0), tmp_path, ("test",), confidence=True)
