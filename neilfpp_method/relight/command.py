@@ -141,6 +141,18 @@ def relight(
 
 def _check(request: RelightRequest) -> None:
     """Check everything that does not need the run."""
+    _check_numbers(request)
+    _check_combinations(request)
+    if request.denoise:
+        check_denoiser()
+    parse_edits(request.edits)
+    parse_lamp_edits(request.lamp_edits)
+    for path in request.env:
+        check_map(path)
+    map_names(request.env)
+
+
+def _check_numbers(request: RelightRequest) -> None:
     positive = {
         "--spp": request.spp,
         "--seconds": request.seconds,
@@ -159,6 +171,11 @@ def _check(request: RelightRequest) -> None:
         )
     if not all(np.isfinite(value) for value in (request.rotate, request.exposure)):
         raise UserError("--rotate or --exposure is not finite", "give degrees and stops")
+
+
+def _check_combinations(request: RelightRequest) -> None:
+    """Reject options that exclude each other, or that have no effect without another one."""
+    circle, sized = TURNTABLE in request.views, request.scale is not None or request.width is not None
     if request.scale is not None and request.width is not None:
         raise UserError("--scale and --width both set the size of views", "give only one of them")
     for option, given in (("--box", request.box is not None), ("--mask", bool(request.mask))):
@@ -169,26 +186,18 @@ def _check(request: RelightRequest) -> None:
             )
     if request.lamp_edits and request.lamps == "drop":
         raise UserError("--lamp changes lamps, but --lamps drop removes all of them", "give only one of both")
-    if TURNTABLE in request.views and len(request.views) > 1:
+    if circle and len(request.views) > 1:
         raise UserError("--views turntable is a circle, and no other views go with it", "give one of them")
-    if request.truth:
-        if TURNTABLE in request.views or request.scale is not None or request.width is not None:
-            raise UserError(
-                "true images can only be compared with views in full size",
-                "leave --views turntable, --scale and --width out",
-            )
-        if len(request.truth) != max(1, len(request.env)):
-            raise UserError(
-                f"{len(request.truth)} folders of true images for {len(request.env)} maps",
-                "give one folder for each map",
-            )
-    if request.denoise:
-        check_denoiser()
-    parse_edits(request.edits)
-    parse_lamp_edits(request.lamp_edits)
-    for path in request.env:
-        check_map(path)
-    map_names(request.env)
+    if request.truth and (circle or sized):
+        raise UserError(
+            "true images can only be compared with views in full size",
+            "leave --views turntable, --scale and --width out",
+        )
+    if request.truth and len(request.truth) != max(1, len(request.env)):
+        raise UserError(
+            f"{len(request.truth)} folders of true images for {len(request.env)} maps",
+            "give one folder for each map",
+        )
 
 
 def _shots(request: RelightRequest, run: Run) -> list[Shot]:
