@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 from scipy.ndimage import binary_erosion
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware
 from neilfpp_method.commands.command import progress_bar
 from neilfpp_method.data.images import read_image
@@ -90,7 +91,7 @@ def blender_picture(python: Path, asset: Path, shot: Shot, out: Path) -> Float[n
         [str(word) for word in words], capture_output=True, text=True, timeout=MAX_SECONDS, check=False
     )
     if done.returncode or not out.is_file():
-        last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+        last = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
         remedy = "name a Python that has bpy with --python (pip install bpy, in an environment of its own)"
         raise UserError(f"{python}: Blender did not render ({last})", remedy)
     return read_image(out).pixels
@@ -107,7 +108,7 @@ def shown_psnr(
 def own_picture(run: Run, name: str, options: Options) -> Picture:
     """The view rendered by the path tracer of this package, under the run's own light and lamps."""
     if not isinstance(run.model.light, EnvironmentLight):
-        raise UserError(f"{run.path}: the light of this run is no environment map", "take another run")
+        raise UserError(f"{run.path}: the light of this run is no environment map", "choose another run")
     view = next((view for view in run.capture.views if view.name == name), None)
     if view is None:
         raise UserError(f"{run.path}: the capture has no view '{name}'", "name one with --camera")
@@ -154,8 +155,4 @@ def main(options: Options, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options), Console(markup=False, highlight=False))
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console(markup=False, highlight=False)))

@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.attach import AttachedNeilf, attach_neilf
@@ -168,4 +169,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    run_benchmark(lambda: main(tyro.cli(Options)))

@@ -14,7 +14,6 @@ test views. A Lambertian surface has the roughness 1 there.
 from __future__ import annotations
 
 import math
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,11 +26,11 @@ from jaxtyping import Float
 from rich.console import Console
 from scipy import ndimage
 
+from benchmarks.command import run_benchmark
 from benchmarks.mitsuba_scene import Lamp, LitScene, Part, PathSampling, load_mitsuba, render
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.views import Camera
-from neilfpp_method.errors import UserError
 
 __all__ = ["SCENES", "KnownScene", "write_capture"]
 
@@ -264,7 +263,7 @@ def main(options: Options, console: Console) -> None:
     for name, scene in SCENES.items():
         root = options.out / name
         if (root / "split.json").exists():
-            console.print(f"{root} is there", soft_wrap=True)
+            console.print(f"{root} exists already", soft_wrap=True)
             continue
         size = (options.width, round(0.75 * options.width))
         console.print(
@@ -273,8 +272,4 @@ def main(options: Options, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options), Console())
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console()))
