@@ -34,7 +34,7 @@ from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.relight.comparison import Comparison, compare, find_truth, read_truth
+from neilfpp_method.relight.comparison import RelitComparison, compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import Materials
 from neilfpp_method.relight.film import Budget, render_picture
@@ -177,7 +177,7 @@ def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
     return rows
 
 
-def figures(found: Comparison, title: str) -> dict[str, float]:
+def figures(found: RelitComparison, title: str) -> dict[str, float]:
     """The figures of the table, under the names of the relit images."""
     renamed = {
         key.replace(title, "relight", 1): value for key, value in found.figures.items() if title in key

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from neilfpp_method.evaluate.metrics import align_scale
 from neilfpp_method.evaluate.pictures import (
     Group,
-    Row,
+    PictureRow,
     Section,
     auto_exposure,
     cut_out,
@@ -79,15 +79,15 @@ class ComparedMap:
         return any(c.truth is not None for c in self.comparisons)
 
     @property
-    def row(self) -> Row:
+    def row(self) -> PictureRow:
         """A row with truth, estimate and error of each view."""
         cells = tuple(cell for c in self.comparisons for cell in (c.truth, c.estimate, c.error))
-        return Row(self.title, cells, self.note, f"{self.largest:g}{self.unit}")
+        return PictureRow(self.title, cells, self.note, f"{self.largest:g}{self.unit}")
 
     @property
-    def estimates(self) -> Row:
+    def estimates(self) -> PictureRow:
         """A row with the estimate of each view."""
-        return Row(self.title, tuple(c.estimate for c in self.comparisons), self.note)
+        return PictureRow(self.title, tuple(c.estimate for c in self.comparisons), self.note)
 
 
 def view_sections(

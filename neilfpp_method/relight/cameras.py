@@ -18,7 +18,7 @@ from neilfpp_method.structures import RayBatch
 
 __all__ = [
     "MAX_WIDTH",
-    "CameraRays",
+    "ImageRays",
     "Shot",
     "pixel_rays",
     "rays_through",
@@ -127,7 +127,7 @@ def resized(camera: Camera, factor: float) -> Camera:
 
 
 @dataclass(frozen=True)
-class CameraRays:
+class ImageRays:
     """Rays through points of an image, in the frame of the camera's pose.
 
     Attributes:
@@ -139,7 +139,7 @@ class CameraRays:
     valid: Bool[Tensor, " N"]
 
 
-def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> CameraRays:
+def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> ImageRays:
     """Build rays through points of the image of a camera.
 
     Args:
@@ -157,12 +157,12 @@ def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> CameraRays:
     rays = RayBatch(
         *(torch.from_numpy(part.astype(np.float32)).to(points.device) for part in (origins, directions))
     )
-    return CameraRays(rays, torch.from_numpy(valid).to(points.device))
+    return ImageRays(rays, torch.from_numpy(valid).to(points.device))
 
 
 def pixel_rays(
     camera: Camera, pixel: Int[Tensor, " N"], within: float | Float[Tensor, "*N 2"] = 0.5
-) -> CameraRays:
+) -> ImageRays:
     """Build a ray through each pixel, given by its row-major index, at a position in [0, 1]² of the pixel."""
     corner = torch.stack((pixel % camera.width, pixel // camera.width), -1)
     return rays_through(camera, corner + within)

@@ -28,7 +28,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.shading.color import srgb_to_linear, tone_map
 
-__all__ = ["Comparison", "TrueImage", "compare", "find_truth", "read_truth"]
+__all__ = ["RelitComparison", "TrueImage", "compare", "find_truth", "read_truth"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TrueImage:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RelitComparison:
     """The result of a comparison.
 
     Attributes:
@@ -117,7 +117,7 @@ def compare(
     relit: Sequence[Float[np.ndarray, "H W 3"]],
     opacity: Sequence[Float[np.ndarray, "H W"]],
     truth: Sequence[TrueImage],
-) -> Comparison:
+) -> RelitComparison:
     """Compute the figures of relit views against the true images.
 
     Args:
@@ -138,7 +138,7 @@ def compare(
     ours = _scores("relight", relit, images, masks, names)
     baseline = _scores("baseline", [true.photograph for true in truth], images, masks, names)
     sources = sorted({true.mask_source for true in truth})
-    return Comparison(ours.figures | baseline.figures, ours.views, ours.scale, ", ".join(sources))
+    return RelitComparison(ours.figures | baseline.figures, ours.views, ours.scale, ", ".join(sources))
 
 
 @dataclass(frozen=True)

@@ -62,13 +62,13 @@ def run_tradeoff(
     if not runs:
         raise UserError(f"{out}: no run could be made", refused)
     points = frontier(runs)
-    for line in table(points):
+    for line in frontier_table(points):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg", soft_wrap=True)
     return points
 
 
-def table(points: Sequence[BudgetResult]) -> list[str]:
+def frontier_table(points: Sequence[BudgetResult]) -> list[str]:
     """The frontier for the terminal: a line per budget, followed by the change of each metric per minute."""
     names = [name for name in FIGURES if points and name in points[0].figures]
     lines = ["budget      took   " + "  ".join(f"{FIGURES[name].title:>20}" for name in names)]

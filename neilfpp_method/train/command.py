@@ -18,7 +18,7 @@ from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import record_exposures, record_facts
-from neilfpp_method.effects.table import table
+from neilfpp_method.effects.table import effects_table
 from neilfpp_method.errors import Unsound
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.mesh import MeshHost
@@ -294,7 +294,7 @@ def _finish(
     if training.fits:
         console.print(f"light: {light_summary(training.config.light, training.fits)}", soft_wrap=True)
     if training.plan.request.base != "as-set":
-        console.print(table(training.plan))
+        console.print(effects_table(training.plan))
     console.print(f"health: {training.watch.health}", soft_wrap=True, markup=False)
     if at_end is not None:
         at_end(run.out)

@@ -20,7 +20,7 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.view.pace import RenderSpeed, sizes
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
-__all__ = ["Frame", "PictureRequest", "frames"]
+__all__ = ["PictureRequest", "ViewerFrame", "frames"]
 
 BOUNCES = 4
 """Largest number of surface vertices of a path."""
@@ -56,7 +56,7 @@ class PictureRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewerFrame:
     """A rendered image, which may be smaller than the window.
 
     Attributes:
@@ -76,7 +76,7 @@ Shader = Callable[[RayBatch, Tensor], Tensor]
 """Maps rays and their pixel indices to RGB and opacity, (N, 4)."""
 
 
-def frames(request: PictureRequest, pace: RenderSpeed) -> Iterator[Frame | None]:
+def frames(request: PictureRequest, pace: RenderSpeed) -> Iterator[ViewerFrame | None]:
     """Yield successively finer images of a request, and None between batches, when rendering may stop.
 
     Args:
@@ -174,7 +174,7 @@ def _opaque(color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
 
 def _frame(
     request: PictureRequest, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int
-) -> Frame:
+) -> ViewerFrame:
     """Convert RGB and opacity to an 8-bit image over the background."""
     shape = (camera.height, camera.width)
     alpha = values[:, 3:].clamp(0, 1)
@@ -187,7 +187,7 @@ def _frame(
         image = display(request.layer, straight)
     opacity = alpha.view(*shape, 1).numpy()
     image = np.rint(opacity * image + (1 - opacity) * 255 * PAPER).astype(np.uint8)
-    return Frame(image, _depth(request.subject, camera), share, samples)
+    return ViewerFrame(image, _depth(request.subject, camera), share, samples)
 
 
 def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:

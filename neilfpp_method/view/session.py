@@ -28,7 +28,7 @@ from neilfpp_method.view.cameras import Pose, pinhole, pose_of
 from neilfpp_method.view.incident_map import SurfacePoint, light_at, light_picture, point_under
 from neilfpp_method.view.pace import RenderSpeed
 from neilfpp_method.view.painter import Painter
-from neilfpp_method.view.pictures import Frame, PictureRequest, frames
+from neilfpp_method.view.pictures import PictureRequest, ViewerFrame, frames
 from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
@@ -192,7 +192,7 @@ class Session:
             )
         )
 
-    def _show(self, frame: Frame) -> None:
+    def _show(self, frame: ViewerFrame) -> None:
         self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=90, depth=frame.depth)
         parts = [f"{frame.image.shape[1]}×{frame.image.shape[0]}"]
         if frame.share < 1:

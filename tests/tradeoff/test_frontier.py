@@ -11,7 +11,7 @@ import re
 
 import pytest
 
-from neilfpp_method.tradeoff.command import table
+from neilfpp_method.tradeoff.command import frontier_table
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import RunResult, frontier
@@ -75,8 +75,8 @@ def test_the_files_agree(tmp_path):
     assert "a &lt;scene&gt;" in drawn
     for label in ("1m: 20.00", "2m: 19.00", "1m: 10.00", "2m: 10.00"):
         assert label in drawn  # every point has its label
-    assert "2m" in "".join(table(frontier(runs)))
-    assert sum("dominated" in line for line in table(frontier(runs))) == 1
+    assert "2m" in "".join(frontier_table(frontier(runs)))
+    assert sum("dominated" in line for line in frontier_table(frontier(runs))) == 1
 
 
 def test_better_is_higher_and_later_is_further_right():
