@@ -75,7 +75,8 @@ class StagePlan:
     """One row of a stage table.
 
     Attributes:
-        weights: for each loss of the stage, the name of the setting in `LossConfig` that holds its weight.
+        weights: for each loss whose weight is a setting, the name of that setting in `LossConfig`. The
+            weights of the other losses are fixed (`active_losses`).
         moves: parameter groups that the stage trains.
         grows: for each loss whose weight changes during the stage, the setting with the factor by which it
             has changed at the end of the stage.
@@ -235,10 +236,14 @@ def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
 
 
 def learning_rate(config: OptimizerConfig, field: str) -> float:
-    """Learning rate of a field before warm-up and decay. The background learns like R, and a field that the
-    settings do not name, such as one of another project's host, like the geometry.
+    """Learning rate of a field before warm-up and decay.
+
+    The background learns at the rate of R. A field with another name, as a host of another project may have
+    one, learns at the rate of the geometry.
     """
-    return getattr(config, "radiance" if field == "background" else field, config.geometry)
+    if field == "background":
+        return config.radiance
+    return getattr(config, field) if field in GEOMETRY | MATERIAL else config.geometry
 
 
 def active_losses(
