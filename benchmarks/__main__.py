@@ -11,7 +11,6 @@ A suite is a module with `measurements()`. docs/performance.md has curves and ta
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,9 +19,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import Measurement, hardware
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 
 __all__ = ["SUITES", "compare", "merged"]
 
@@ -103,8 +104,4 @@ def _table(measured: Sequence[Measurement], known: Mapping[str, float], worse: S
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Options), Console()))
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console()))

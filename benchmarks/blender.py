@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 from scipy.ndimage import binary_erosion
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware
 from neilfpp_method.commands.command import progress_bar
 from neilfpp_method.data.images import read_image
@@ -41,7 +42,7 @@ from neilfpp_method.relight.sky import sky_of_run
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.run import Run, load_run
 
-__all__ = ["blender_picture", "shown_psnr"]
+__all__ = ["Shot", "blender_picture", "shown_psnr"]
 
 BOUNCES = 6
 TEXTURE_SIZE, FACES, ERROR = 2048, 30_000, 0.001
@@ -68,27 +69,29 @@ class Options:
     """Folder for the asset and Blender's images; default: they are not kept."""
 
 
-def blender_picture(
-    python: Path,
-    asset: Path,
-    camera: str,
-    out: Path,
-    source: Literal["glb", "usd"] = "glb",
-    percent: int = 100,
-    samples: int = 128,
-) -> Float[np.ndarray, "H W 3"]:
+@dataclass(frozen=True)
+class Shot:
+    """An image that Blender renders: the name of a camera, the file that it opens, size and samples."""
+
+    camera: str
+    source: Literal["glb", "usd"] = "glb"
+    percent: int = 100
+    samples: int = 128
+
+
+def blender_picture(python: Path, asset: Path, shot: Shot, out: Path) -> Float[np.ndarray, "H W 3"]:
     """Linear radiance rendered by Cycles with the script of the asset; the map is visible behind the surface.
 
     Raises:
         UserError: that Python has no bpy, or the script fails.
     """
-    words = [python, asset / "open_in_blender.py", "--camera", camera, "--render", out, "--source", source]
-    words += ["--percent", percent, "--samples", samples]
+    words = [python, asset / "open_in_blender.py", "--camera", shot.camera, "--render", out]
+    words += ["--source", shot.source, "--percent", shot.percent, "--samples", shot.samples]
     done = subprocess.run(
         [str(word) for word in words], capture_output=True, text=True, timeout=MAX_SECONDS, check=False
     )
     if done.returncode or not out.is_file():
-        last = (done.stderr.strip() or done.stdout.strip() or "no word").splitlines()[-1]
+        last = (done.stderr.strip() or done.stdout.strip() or "no output").splitlines()[-1]
         remedy = "name a Python that has bpy with --python (pip install bpy, in an environment of its own)"
         raise UserError(f"{python}: Blender did not render ({last})", remedy)
     return read_image(out).pixels
@@ -105,7 +108,7 @@ def shown_psnr(
 def own_picture(run: Run, name: str, options: Options) -> Picture:
     """The view rendered by the path tracer of this package, under the run's own light and lamps."""
     if not isinstance(run.model.light, EnvironmentLight):
-        raise UserError(f"{run.path}: the light of this run is no environment map", "take another run")
+        raise UserError(f"{run.path}: the light of this run is no environment map", "choose another run")
     view = next((view for view in run.capture.views if view.name == name), None)
     if view is None:
         raise UserError(f"{run.path}: the capture has no view '{name}'", "name one with --camera")
@@ -130,7 +133,9 @@ def compare(options: Options, folder: Path, console: Console) -> None:
         if not (asset / f"asset.{source}{'a' if source == 'usd' else ''}").is_file():
             continue
         out = folder / f"{name}-{source}.exr"
-        theirs = blender_picture(options.python, asset, name, out, source, options.percent, options.samples)
+        theirs = blender_picture(
+            options.python, asset, Shot(name, source, options.percent, options.samples), out
+        )
         share = theirs[within].mean(0) / radiance[within].mean(0)
         channels = ", ".join(f"{factor:.3f}" for factor in share)
         console.print(
@@ -150,8 +155,4 @@ def main(options: Options, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options), Console(markup=False, highlight=False))
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console(markup=False, highlight=False)))

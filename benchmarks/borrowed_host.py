@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.attach import AttachedNeilf, attach_neilf
@@ -37,7 +38,7 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.optimizer import adam, seed_step, set_rates
+from neilfpp_method.train.optimizer import Stream, adam, seed_step, seed_stream, set_rates
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import Run, load_run
 
@@ -110,7 +111,7 @@ def borrow(capture: Capture, pixels: PixelDataset, config: NeilfConfig, path: Pa
     """Train material and light on the function, in a training loop like that of a user."""
     facts = scene_facts(capture, pixels, config)
     mesh = build_model(capture, facts, config).host
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     neilf: AttachedNeilf = attach_neilf(
         TrueSurface(mesh, pixels),
         config,
@@ -168,4 +169,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    run_benchmark(lambda: main(tyro.cli(Options)))

@@ -52,10 +52,12 @@ def draw_charts(
     """Write panels with common axes and one legend as a PNG, `columns` panels side by side."""
     names = list(dict.fromkeys(name for chart in charts for name in chart.lines))
     lines = [line for chart in charts for line in chart.lines.values()]
-    x_range, y_range = (
+    axes = Axes(
         _range([x for line in lines for x in line.x]),
         _range([y for line in lines for y in line.y]),
+        f"{y_name} over {x_name}",
     )
+    colors = {name: COLORS[number % len(COLORS)] for number, name in enumerate(names)}
     rows = math.ceil(len(charts) / columns)
     width = columns * (LEFT + WIDTH + GAP) + GAP
     per_line = max(1, width // 250)
@@ -65,15 +67,30 @@ def draw_charts(
     _write(draw, (GAP, 16), title, 22)
     for number, name in enumerate(names):
         x, y = GAP + number % per_line * 250, HEAD + number // per_line * LEGEND
-        draw.line([(x, y + 9), (x + 26, y + 9)], fill=_color(number), width=3)
+        draw.line([(x, y + 9), (x + 26, y + 9)], fill=colors[name], width=3)
         _write(draw, (x + 34, y), name, 15)
     for number, chart in enumerate(charts):
         corner = (
             number % columns * (LEFT + WIDTH + GAP) + LEFT,
             head + number // columns * (TOP + HEIGHT + BOTTOM) + TOP,
         )
-        _panel(draw, corner, chart, names, x_range, y_range, f"{y_name} over {x_name}")
+        _panel(draw, corner, chart, axes, colors)
     write_png(path, np.asarray(sheet))
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Decimal logarithms of the smallest and largest x and y, and the caption."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    caption: str
+
+    def place(self, corner: tuple[int, int], x: float, y: float) -> tuple[float, float]:
+        """Pixel of a point in the panel whose upper left corner is given."""
+        across = (math.log10(x) - self.x[0]) / (self.x[1] - self.x[0])
+        up = (math.log10(y) - self.y[0]) / (self.y[1] - self.y[0])
+        return corner[0] + across * WIDTH, corner[1] + (1 - up) * HEIGHT
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
@@ -86,34 +103,25 @@ def _panel(
     draw: ImageDraw.ImageDraw,
     corner: tuple[int, int],
     chart: Chart,
-    names: Sequence[str],
-    x_range: tuple[float, float],
-    y_range: tuple[float, float],
-    caption: str,
+    axes: Axes,
+    colors: Mapping[str, tuple[int, int, int]],
 ) -> None:
     left, top = corner
-
-    def place(x: float, y: float) -> tuple[float, float]:
-        across = (math.log10(x) - x_range[0]) / (x_range[1] - x_range[0])
-        up = (math.log10(y) - y_range[0]) / (y_range[1] - y_range[0])
-        return left + across * WIDTH, top + (1 - up) * HEIGHT
-
     _write(draw, (left, top - 26), chart.title, 16)
-    for tick in _ticks(*x_range):
-        x, _ = place(tick, 10 ** y_range[0])
+    for tick in _ticks(*axes.x):
+        x, _ = axes.place(corner, tick, 10 ** axes.y[0])
         draw.line([(x, top), (x, top + HEIGHT)], fill=GRID)
         _write(draw, (x - 8, top + HEIGHT + 4), f"{tick:g}", 12, PALE_INK)
-    for tick in _ticks(*y_range):
-        _, y = place(10 ** x_range[0], tick)
+    for tick in _ticks(*axes.y):
+        _, y = axes.place(corner, 10 ** axes.x[0], tick)
         draw.line([(left, y), (left + WIDTH, y)], fill=GRID)
         _write(draw, (left - 44, y - 8), f"{tick:g}", 12, PALE_INK)
-    _write(draw, (left, top + HEIGHT + 20), caption, 12, PALE_INK)
+    _write(draw, (left, top + HEIGHT + 20), axes.caption, 12, PALE_INK)
     for name, line in chart.lines.items():
-        points = [place(x, y) for x, y in zip(line.x, line.y, strict=True)]
-        color = _color(names.index(name))
-        draw.line(points, fill=color, width=3, joint="curve")
+        points = [axes.place(corner, x, y) for x, y in zip(line.x, line.y, strict=True)]
+        draw.line(points, fill=colors[name], width=3, joint="curve")
         for x, y in points:
-            draw.ellipse([(x - 3, y - 3), (x + 3, y + 3)], fill=color)
+            draw.ellipse([(x - 3, y - 3), (x + 3, y + 3)], fill=colors[name])
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -123,10 +131,6 @@ def _ticks(low: float, high: float) -> list[float]:
         step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps
     ]
     return [tick for tick in candidates if low <= math.log10(tick) <= high]
-
-
-def _color(number: int) -> tuple[int, int, int]:
-    return COLORS[number % len(COLORS)]
 
 
 def _write(

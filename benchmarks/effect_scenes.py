@@ -14,7 +14,6 @@ test views. A Lambertian surface has the roughness 1 there.
 from __future__ import annotations
 
 import math
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,11 +26,11 @@ from jaxtyping import Float
 from rich.console import Console
 from scipy import ndimage
 
-from benchmarks.mitsuba_scene import Lamp, Part, load_mitsuba, render
+from benchmarks.command import run_benchmark
+from benchmarks.mitsuba_scene import Lamp, LitScene, Part, PathSampling, load_mitsuba, render
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.views import Camera
-from neilfpp_method.errors import UserError
 
 __all__ = ["SCENES", "KnownScene", "write_capture"]
 
@@ -202,14 +201,13 @@ def write_capture(mi, scene: KnownScene, root: Path, views: int, size: tuple[int
     rows = np.array(
         [[*p.base_color, 1.0 if p.roughness is None else p.roughness, p.metallic] for p in scene.parts]
     )
+    lit = LitScene(scene.parts, scene.radiance, scene.lamps)
     tracks, files, test = {}, {}, []
     for i in range(views):
         elevation = math.radians(scene.elevations[i % 2])
         camera, name = camera_at(2 * math.pi * i / views, elevation, width, height), f"{i:03d}"
         with tempfile.TemporaryDirectory() as folder:
-            picture = render(
-                mi, scene.parts, scene.radiance, camera, Path(folder), samples, BOUNCES, i, scene.lamps
-            )
+            picture = render(mi, lit, camera, PathSampling(samples, BOUNCES, seed=i), Path(folder))
         seen = look(mesh, part_of_face, camera)
         write_exr(inputs / "images" / f"{name}.exr", {"RGB": picture.astype(np.float32)})
         write_exr(inputs / "depth_maps" / f"{name}.exr", {"Y": seen.depth.astype(np.float32)})
@@ -265,7 +263,7 @@ def main(options: Options, console: Console) -> None:
     for name, scene in SCENES.items():
         root = options.out / name
         if (root / "split.json").exists():
-            console.print(f"{root} is there", soft_wrap=True)
+            console.print(f"{root} exists already", soft_wrap=True)
             continue
         size = (options.width, round(0.75 * options.width))
         console.print(
@@ -274,8 +272,4 @@ def main(options: Options, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options), Console())
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console()))

@@ -11,7 +11,6 @@ contradicts the truth. The reason of each wrong decision follows below the table
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from benchmarks.command import run_benchmark
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.json_files import read_json
 
@@ -97,10 +97,11 @@ class Options:
     """Folders of runs."""
 
 
+def main(options: Options, console: Console) -> None:
+    """Print the table."""
+    for line in markdown([read_run(path) for path in options.runs]):
+        console.print(line, markup=False, soft_wrap=True, highlight=False)
+
+
 if __name__ == "__main__":
-    try:
-        for line in markdown([read_run(path) for path in tyro.cli(Options).runs]):
-            Console().print(line, markup=False, soft_wrap=True, highlight=False)
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console()))

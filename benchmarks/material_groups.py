@@ -8,7 +8,6 @@ end of a stage. The output is a Markdown table per run with a row for each group
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -18,6 +17,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.views import KnownView, known_test_views
@@ -133,8 +133,4 @@ def main(runs: tyro.conf.Positional[tuple[str, ...]], console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(tuple[str, ...], description=__doc__), Console())
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(tuple[str, ...], description=__doc__), Console()))

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 
-__all__ = ["Lamp", "Part", "load_mitsuba", "render"]
+__all__ = ["Lamp", "LitScene", "Part", "PathSampling", "load_mitsuba", "render"]
 
 BSDF = "neilfpp"
 
@@ -42,6 +42,24 @@ class Lamp:
     radiance: tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class LitScene:
+    """Surfaces, a map in this package's layout whose first and last rows are at the poles, and lamps."""
+
+    parts: Sequence[Part]
+    radiance: Float[np.ndarray, "H W 3"]
+    lamps: Sequence[Lamp] = ()
+
+
+@dataclass(frozen=True)
+class PathSampling:
+    """Samples per pixel, largest number of surfaces on a path, and seed."""
+
+    samples: int
+    bounces: int
+    seed: int
+
+
 def load_mitsuba(variant: str):
     """Load Mitsuba in a variant, and register the BRDF of METHOD §1.
 
@@ -61,74 +79,66 @@ def load_mitsuba(variant: str):
 
 
 def render(
-    mi,
-    parts: Sequence[Part],
-    radiance: Float[np.ndarray, "H W 3"],
-    camera: Camera,
-    folder: Path,
-    samples: int,
-    bounces: int,
-    seed: int,
-    lamps: Sequence[Lamp] = (),
+    mi, scene: LitScene, camera: Camera, sampling: PathSampling, folder: Path
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of a scene under a map in this package's layout, and lamps, 0 where no surface is.
+    """Linear radiance of a scene, 0 where no surface is.
 
     Args:
         mi: Mitsuba, as `load_mitsuba` returns it.
-        parts: the surfaces.
-        radiance: the map, whose first and last rows are at the poles, as in Mitsuba.
+        scene: the surfaces and the light.
         camera: a pinhole camera with its principal point in the middle of the image.
+        sampling: number, length and seed of the paths.
         folder: folder for the files of the meshes.
-        samples: samples per pixel.
-        bounces: maximum number of surfaces on a path.
-        seed: seed of the samples.
-        lamps: lamps in addition to the map.
     """
-    transform = mi.ScalarTransform4f
-    pose = np.eye(4)
-    pose[:3] = camera.c2w
-    scene = {
+    bounces = sampling.bounces
+    described = {
         "type": "scene",
         "integrator": {"type": "path", "max_depth": bounces + 1, "rr_depth": bounces, "hide_emitters": True},
-        "sensor": {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
-            "fov_axis": "x",
-            "to_world": transform(pose @ np.diag([-1.0, -1.0, 1.0, 1.0])),  # its x is left, its y up
-            "film": {
-                "type": "hdrfilm",
-                "width": camera.width,
-                "height": camera.height,
-                "pixel_format": "rgb",
-                "component_format": "float32",
-                "rfilter": {"type": "box"},
-            },
-            "sampler": {"type": "independent", "sample_count": samples},
-        },
+        "sensor": _sensor(mi, camera, sampling.samples),
         # Its maps are about +y, with the azimuth from −z to +x; ours about +z, from +y to +x.
         "light": {
             "type": "envmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, np.float32)),
-            "to_world": transform().rotate([1, 0, 0], 90),
+            "bitmap": mi.Bitmap(np.ascontiguousarray(scene.radiance, np.float32)),
+            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
         },
     }
-    for k, part in enumerate(parts):
+    for k, part in enumerate(scene.parts):
         path = folder / f"part_{k}.ply"
         path.write_bytes(part.mesh.export(file_type="ply", vertex_normal=False))
-        scene[f"part_{k}"] = {
+        described[f"part_{k}"] = {
             "type": "ply",
             "filename": str(path),
             "face_normals": True,
             "bsdf": _material(part),
         }
-    for k, lamp in enumerate(lamps):
-        scene[f"lamp_{k}"] = {
+    for k, lamp in enumerate(scene.lamps):
+        described[f"lamp_{k}"] = {
             "type": "sphere",
             "center": list(lamp.position),
             "radius": lamp.radius,
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(lamp.radiance)}},
         }
-    return np.array(mi.render(mi.load_dict(scene), seed=seed))[..., :3]
+    return np.array(mi.render(mi.load_dict(described), seed=sampling.seed))[..., :3]
+
+
+def _sensor(mi, camera: Camera, samples: int) -> dict[str, object]:
+    pose = np.eye(4)
+    pose[:3] = camera.c2w
+    return {
+        "type": "perspective",
+        "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
+        "fov_axis": "x",
+        "to_world": mi.ScalarTransform4f(pose @ np.diag([-1.0, -1.0, 1.0, 1.0])),  # its x is left, its y up
+        "film": {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+        "sampler": {"type": "independent", "sample_count": samples},
+    }
 
 
 def _material(part: Part) -> dict[str, object]:

@@ -1,18 +1,17 @@
-"""The path tracer of `neilfpp relight` against Mitsuba 3.
+"""Compare the path tracer of `neilfpp relight` with Mitsuba 3.
 
     python -m benchmarks.relight
     python -m benchmarks.relight --variant llvm_ad_rgb --width 32 --spp 1024 --reference-spp 16384
 
-A ball of metal and one of paint in a corner, under a map with a sun, direct light alone and with six bounces.
-`error` is the mean |ours − Mitsuba's| over the mean radiance, Mitsuba's the mean of two pictures; `noise` is
-the mean difference of those two, `bias` the difference of the means. Trained runs and true materials under
-another light: `benchmarks/relit.py`.
+The scene is a ball of metal and one of paint in a corner, under a map with a sun, with direct light only and
+with six bounces. `error` is the mean |ours − Mitsuba's| over the mean radiance, where Mitsuba's image is
+the mean of two; `noise` is the mean difference of those two, and `bias` the difference of the means.
+`benchmarks/relit.py` compares trained runs and true materials under another light.
 """
 
 from __future__ import annotations
 
 import math
-import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -26,10 +25,10 @@ from jaxtyping import Float
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware
-from benchmarks.mitsuba_scene import Part, load_mitsuba, render
+from benchmarks.mitsuba_scene import LitScene, Part, PathSampling, load_mitsuba, render
 from neilfpp_method.data.views import Camera
-from neilfpp_method.errors import UserError
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.sky import Sky
@@ -129,8 +128,9 @@ def agreement(variant: str, width: int, spp: int, reference_spp: int, bounces: i
     seconds = time.perf_counter() - begun
     with tempfile.TemporaryDirectory() as folder:
         begun = time.perf_counter()
+        lit = LitScene(parts, radiance.numpy())
         theirs = [
-            render(mi, parts, radiance.numpy(), camera, Path(folder), reference_spp, bounces, seed)
+            render(mi, lit, camera, PathSampling(reference_spp, bounces, seed), Path(folder))
             for seed in (1, 2)
         ]
         seconds_of_mitsuba = (time.perf_counter() - begun) / 2
@@ -159,8 +159,4 @@ def main(options: Options, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options), Console())
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console()))

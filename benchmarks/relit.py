@@ -1,13 +1,13 @@
-"""Trained runs under a light that they have not seen, against true pictures.
+"""Compare trained runs under a light that they were not trained with with true images.
 
     python -m benchmarks.relit --capture DATA/tabletop_env --under DATA/tabletop_relight
     python -m benchmarks.relit --capture DATA/tabletop_env --under DATA/tabletop_relight --runs RUN --exchange
 
-Rows, each over the capture's test views: the training image of the view, returned as it is; the true
-surface with the true material, whose error is that of the tracer, its noise included; and each run.
-`--exchange` adds two rows for each run that name a cause: its roughness and metallic with the true base
-colour, and its base colour with the true roughness and metallic. Figures are those of `neilfpp relight
---truth`. With `--save NAME` they go to docs/relighting.md.
+The rows are means over the test views: for the photograph of the view as it is; for the true surface with
+the true material, which has only the error and noise of the path tracer; and for each run. `--exchange` adds
+two rows per run that show the cause of its error: its roughness and metallic with the true base colour, and
+its base colour with the true roughness and metallic. The figures are those of `neilfpp relight --truth`.
+`--save NAME` writes them for docs/relighting.md.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rich.console import Console
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.data.capture import Capture, load_capture
@@ -33,7 +34,7 @@ from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.relight.comparison import Comparison, compare, find_truth, read_truth
+from neilfpp_method.relight.comparison import RelitComparison, compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import Materials
 from neilfpp_method.relight.film import Budget, render_picture
@@ -176,7 +177,7 @@ def measure(options: Options, say: Callable[[str], None]) -> list[Row]:
     return rows
 
 
-def figures(found: Comparison, title: str) -> dict[str, float]:
+def figures(found: RelitComparison, title: str) -> dict[str, float]:
     """The figures of the table, under the names of the relit images."""
     renamed = {
         key.replace(title, "relight", 1): value for key, value in found.figures.items() if title in key
@@ -212,8 +213,4 @@ def main(options: Options, console: Console) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Options), Console(markup=False))
-    except UserError as error:
-        Console(stderr=True).print(f"error: {error}", markup=False)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options), Console(markup=False)))

@@ -4,12 +4,12 @@
     python -m benchmarks.results DATA/tabletop_env DATA/tabletop_mix --out runs/results-mesh \
         --host mesh --compare ladder
 
-For each capture: the preset trained from scratch, beside it the paper's free light field with and without
-L_ref (the paper's Table 2), with `--compare ladder` every light with every inter-reflection that goes with
-it; each measured after the material stage (the paper's "Sep.") and after the joint stage (Table 3), beside
-baselines that need no method. The runs share the stage SDF init, which none of this enters; every step
-depends on seed and number alone, so sharing changes nothing. With the mesh host geometry is given, and there
-is one stage. `--save NAME` keeps the figures for docs/results.md.
+For each capture the preset is trained, and the paper's free light field with and without L_ref (the paper's
+Table 2); with `--compare ladder` also every light with every inter-reflection that it allows. Each is
+measured after material init (the paper's "Sep.") and after the joint stage (Table 3), and compared with
+baselines that need no method. The runs share SDF init, in which they do not differ; a step depends only on
+its seed and number, so sharing changes no result. With `--host mesh` the geometry is given and there is no
+joint stage. `--save NAME` writes the figures of docs/results.md.
 """
 
 from __future__ import annotations
@@ -25,8 +25,10 @@ import tyro
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.report.write import REPORT, write_report
@@ -36,8 +38,8 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint, load_checkpoint, save_checkpoint
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.json_files import read_json, write_json
-from neilfpp_method.train.optimizer import make_optimizer, seed_step
+from neilfpp_method.train.json_files import read_json
+from neilfpp_method.train.optimizer import Stream, make_optimizer, seed_stream
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import create_run, load_run, read_description
 
@@ -123,7 +125,7 @@ def branch(trunk: Path, out: Path, config: NeilfConfig) -> None:
     """Create a run at the end of SDF init with the host of the trunk, and an untrained material and light."""
     described = read_description(trunk)
     saved = load_checkpoint(checkpoint_path(trunk, "sdf_init"))
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     model = build_model(described.source.load(), described.facts, config)
     own = model.state_dict()
     shared = {
@@ -221,4 +223,4 @@ def seconds_until(stage: str, seconds: dict[str, float]) -> float:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    run_benchmark(lambda: main(tyro.cli(Options)))

@@ -8,8 +8,8 @@ and the true light interpolated between its 4096 directions; the reference is th
 directions of all techniques together. The error is the root of the mean square over points, views, channels
 and repetitions, divided by that of the reference.
 
-Beside the samplers that know nothing of the light, `mis` is measured with an environment map that is the mean
-of what arrives at all points: what training comes to know.
+`mis` is measured with an environment map as well: the mean of the light that arrives at all points, which is
+what training can find out about it. The other samplers do not depend on the light.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from rich.console import Console
 from torch import Tensor
 
 from benchmarks.charts import Chart, Line, draw_charts
+from benchmarks.command import run_benchmark
 from benchmarks.measure import Measurement, hardware, in_yardsticks
 from benchmarks.true_light import TrueLight, read_light, true_light
 from neilfpp_method.data.truth import LightField
@@ -228,4 +229,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    run_benchmark(lambda: main(tyro.cli(Options)))

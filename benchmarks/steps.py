@@ -24,7 +24,7 @@ from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.build import build_model, scene_facts
-from neilfpp_method.train.optimizer import make_optimizer, seed_step
+from neilfpp_method.train.optimizer import Stream, make_optimizer, seed_step, seed_stream
 
 __all__ = ["measurements", "model_of", "pixels_of", "step_of"]
 
@@ -55,7 +55,7 @@ def _pixels() -> PixelDataset:
 def model_of(name: str) -> NeilfModel:
     """The untrained model of a preset."""
     config, pixels = config_of(name), _pixels()
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     return build_model(pixels.capture, scene_facts(pixels.capture, pixels, config), config).to(device())
 
 

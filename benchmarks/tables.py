@@ -18,15 +18,15 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
+from benchmarks.command import run_benchmark
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
-from neilfpp_method.train.json_files import write_json
 
 __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "write_result"]
 
@@ -71,7 +71,7 @@ COLUMNS: Mapping[str, Column] = {
     "peak_gb": Column("peak, GB"),
     "files_gb": Column("files of pixels, GB"),
     "planes_gb": Column("float32 planes, GB"),
-    "naive_ms": Column("as one writes it down, ms", 0),
+    "naive_ms": Column("torch alone, ms", 0),
     "reference_ms": Column("reference, ms", 0),
     "compiled_ms": Column("compiled loops, ms", 0),
     "queries_wide": Column("queries a ray, β = 0.03", 0),
@@ -253,8 +253,4 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main(tyro.cli(Options)))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(error.status)
+    run_benchmark(lambda: main(tyro.cli(Options)))

@@ -1,13 +1,13 @@
-"""What training time buys: the quality of novel views and of the material over seconds, for every preset.
+"""Quality of novel views and of the material over training time, for every preset.
 
     python -m benchmarks.time_to_quality DATA/tabletop_mix --out docs
     python -m benchmarks.time_to_quality DATA/tabletop_mix --presets paper-ngp --out docs \
         --device cuda --cap 600
 
-Each preset trains from scratch. At marks of time (seconds of the process's own CPU time, or on a GPU of the
-clock), each twice the last, training is held, some test views are rendered and measured, and the time that
-takes does not count. `fast` runs to its end; a preset that is stopped by the cap is shown as unfinished, with
-the step that it reached: its rates have not fallen, and its material may not have begun.
+Each preset trains from scratch. Its test views are measured at times of which each is twice the one before
+(CPU time of the process; on a GPU, wall-clock time); the measurements themselves do not count. `fast` runs to
+its end. A preset that is stopped by `--cap` is marked as unfinished, with the step that it reached: its
+learning rates have not decreased yet, and its material may not have been trained.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import tyro
 from rich.console import Console
 
 from benchmarks.charts import Chart, Line, draw_charts
+from benchmarks.command import run_benchmark
 from benchmarks.measure import clock, hardware
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.pixels import PixelDataset
@@ -35,7 +36,14 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates, waiting_fields
+from neilfpp_method.train.optimizer import (
+    Stream,
+    make_optimizer,
+    seed_step,
+    seed_stream,
+    set_rates,
+    waiting_fields,
+)
 from neilfpp_method.train.run import Run
 
 __all__ = ["Curve", "Mark", "curve", "table"]
@@ -90,7 +98,7 @@ class Curve:
         return self.marks[-1].step == self.steps
 
     def line(self, figure: str) -> Line | None:
-        """A figure over seconds, from when it is there."""
+        """A figure over seconds, from its first measurement on."""
         known = [(mark.seconds, mark.figures[figure]) for mark in self.marks if figure in mark.figures]
         return Line(*zip(*known, strict=True)) if known else None
 
@@ -102,7 +110,7 @@ def curve(
     capture = load_capture(root)
     pixels = PixelDataset(capture, capture.train_views, device=device)
     facts = scene_facts(capture, pixels, config)
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     model = build_model(capture, facts, config).to(device)
     shown = dataclasses.replace(capture, test=frozenset(view.name for view in capture.test_views[:views]))
     steps = sum(stage_steps(config.train).values())
@@ -201,4 +209,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    run_benchmark(lambda: main(tyro.cli(Options)))

@@ -7,7 +7,6 @@ Scene and settings are those of `benchmarks.sampler`: a table and two balls.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 
 import torch
@@ -29,7 +28,7 @@ HIT_SHARE = 0.8
 
 def measurements() -> Iterator[Measurement]:
     """Time per ray by both methods, the number of rendered rays, and the share of missed hits."""
-    settings = dataclasses.replace(preset("paper-ngp").inter_reflection, rays_per_point=1.0)
+    settings = preset("paper-ngp")  # one ray per point
     plain, cached = table_host(skip_empty=False), table_host()
     with torch.no_grad(), computing_fast():
         hits = plain.render(rays_at_the_table(POINTS).rays)
@@ -38,7 +37,7 @@ def measurements() -> Iterator[Measurement]:
 
         def trace(host: VolSdfHost) -> TracedLight:
             torch.manual_seed(0)
-            return trace_light(host, points, normals, settings, HIT_SHARE)
+            return trace_light(host, points, normals, settings)
 
         rays = _Recorder(plain)
         hit, chosen = trace(rays).hit, trace(cached)

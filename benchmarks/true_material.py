@@ -1,10 +1,10 @@
-"""What bounds the light: solved for under the true material, with the scene's own radiance from a run.
+"""Error of the light that remains if the material is known.
 
     python -m benchmarks.true_material RUN [RUN …]
 
-A run with a given mesh on a capture whose test views have true materials: points of these views, their true
-base colour, roughness and metallic, and their pixels are what the light is fitted to, from nothing, as often
-as `--fits` says. The error of the light is that of `neilfpp eval`, beside what the run itself came to.
+The runs need a given mesh, and test views with true materials. From an even light on, the light is fitted
+`--fits` times to points of these views, with their true base colour, roughness and metallic and with R of the
+run. The output has the figures of `neilfpp eval` for this light and for that of the run.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import tyro
 from rich.console import Console
 from torch import Tensor
 
+from benchmarks.command import run_benchmark
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
@@ -40,33 +41,31 @@ class Options:
     """Solve for the light of runs under the true material."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
-    """Run folders; geometry given, a map for a light."""
+    """Run folders with a given mesh and an environment map."""
     fits: int = 12
-    """Fits, each to points of its own."""
+    """Number of fits, each to other points."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Surface points of the test views, and what they truly are made of."""
+    """Surface points of the test views with their pixels, and their true material."""
 
-    seen: Observed
+    observed: Observed
     material: Material
 
 
 @torch.no_grad()
 def known_points(run: Run) -> Known:
-    """All pixels of the test views that the host hits and the truth knows.
+    """All pixels of the test views that hit the surface and have a true material.
 
     Raises:
         UserError: the capture has no true materials.
     """
-    rendered = render_test_views(
-        dataclasses.replace(run, step=0)
-    )  # without material: the host's maps are enough
+    rendered = render_test_views(dataclasses.replace(run, step=0))  # without material
     parts = []
     for known in known_test_views(run, rendered).views:
         if known.material is None:
-            raise UserError(f"{run.capture.root}: no true materials", "take a capture with ground truth")
+            raise UserError(f"{run.capture.root}: no true materials", "choose a capture with ground truth")
         rays = camera_rays(run.capture.scene_camera(known.view))
         hits = run.model.host.render(rays)
         rows = torch.nonzero(
@@ -81,7 +80,7 @@ def known_points(run: Run) -> Known:
 
 @torch.no_grad()
 def solve_under_truth(run: Run, known: Known, fits: int) -> None:
-    """Forget the light of the run, and set it anew."""
+    """Fit the light of the run again, from an even light on."""
     model, settings = run.model, run.config.light
     model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
     model.lamps.count = 0
@@ -90,17 +89,19 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
         model.facts.response, model.units.physical, settings.fit.steps, base_color_known=True
     )
     for _ in range(fits):
-        rows = torch.randperm(len(known.seen.position))[: settings.fit.points]
-        points = FitPoints(known.seen[rows], known.material[rows], model.lobe, model.scene)
+        rows = torch.randperm(len(known.observed.position))[: settings.fit.points]
+        points = FitPoints(known.observed[rows], known.material[rows], model.lobe, model.scene)
         solve_light(light, points, objective, settings, first=False)
 
 
 def line(run: Run, title: str) -> str:
-    """The light errors of a run, and its lamps."""
+    """The errors of the light of a run, and its lamps."""
     truth = Truth(run.capture)
     field = truth.light_field()
     if field is None:
-        raise UserError(f"{run.capture.root}: no true light", "take a capture with light/light_field_gt.npz")
+        raise UserError(
+            f"{run.capture.root}: no true light", "choose a capture with light/light_field_gt.npz"
+        )
     figures = light_metrics(run, field, truth.mesh())
     text = f"{title:>22}: " + ", ".join(
         f"{name.removeprefix('incident_light_')} {x:.3f}" for name, x in figures.items()
@@ -115,14 +116,14 @@ def line(run: Run, title: str) -> str:
 
 
 def main(options: Options) -> None:
-    """Print the light of each run, learned and under the true material."""
+    """Print the figures of the light of each run, and of the light under the true material."""
     console = Console()
     for path in options.runs:
         run = load_run(path)
         if not isinstance(run.model.light, EnvironmentLight):
             raise UserError(
                 f"{path}: its light is no environment map",
-                "take a run with --config.light.kind auto or distant",
+                "choose a run with --config.light.kind auto or distant",
             )
         run.model.eval()
         console.print(str(path), highlight=False, soft_wrap=True)
@@ -133,4 +134,4 @@ def main(options: Options) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    run_benchmark(lambda: main(tyro.cli(Options)))

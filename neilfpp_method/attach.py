@@ -39,7 +39,7 @@ from neilfpp_method.hosts.image import rays_like
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, stage_at, weigh
+from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, learning_rate, stage_at, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -192,9 +192,7 @@ class AttachedNeilf(nn.Module):
         """
         rates = self.model.config.optimizer
         groups = self.parameter_groups().items()
-        return [
-            {"params": p, "lr": getattr(rates, name, rates.geometry), "name": name} for name, p in groups if p
-        ]
+        return [{"params": p, "lr": learning_rate(rates, name), "name": name} for name, p in groups if p]
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field."""
@@ -309,6 +307,34 @@ def attach_neilf(
         UserError: the host has none of these forms or takes other arguments, no preset has this name, an
             argument is out of range, or the environment map that the settings name cannot be used.
     """
+    facts = _facts(response, median_radiance, radiance_scale, open_scene)
+    adapted = adapt(host, response)
+    borrowed = not isinstance(host, HasParameterGroups)
+    if not borrowed:
+        check_parameter_groups(host)
+    if isinstance(config, str):
+        config = preset(config)
+        config = replace(config, train=replace(config.train, sdf_steps=0)) if borrowed else config
+    if not isinstance(config, NeilfConfig):
+        raise UserError(
+            f"config is a {type(config).__name__}", "give a NeilfConfig, or the name of a preset, as 'fast'"
+        )
+    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
+    # Parameters that are made in inference mode could never be trained.
+    with torch.inference_mode(False), torch.random.fork_rng(devices):
+        proxy = proxy_for(adapted, config)
+        complete = adapted if isinstance(adapted, TracesLight) else ForeignHost(adapted, borrowed, proxy)
+        attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
+    if config.known_map is not None:
+        attached.model.light.show(read_environment(Path(config.known_map)))
+    log.warning("NeILF++ attached to %s: %s", host_name(adapted), _attachment_summary(attached, borrowed))
+    return attached
+
+
+def _facts(
+    response: str, median_radiance: float, radiance_scale: float | None, open_scene: bool
+) -> SceneFacts:
+    """What the arguments of `attach_neilf` say about the images, checked."""
     if response not in RADIANCE_SCALE:
         raise UserError(
             f"response '{response}'",
@@ -321,28 +347,7 @@ def attach_neilf(
         )
     if not 0 < scale < math.inf:
         raise UserError(f"radiance_scale is {scale}", "give the largest radiance of the host, above 0")
-    adapted = adapt(host, response)
-    borrowed = not isinstance(host, HasParameterGroups)
-    if not borrowed:
-        check_parameter_groups(host)
-    if isinstance(config, str):
-        config = preset(config)
-        config = replace(config, train=replace(config.train, sdf_steps=0)) if borrowed else config
-    if not isinstance(config, NeilfConfig):
-        raise UserError(
-            f"config is a {type(config).__name__}", "give a NeilfConfig, or the name of a preset, as 'fast'"
-        )
-    facts = SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
-    devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
-    # Parameters that are made in inference mode could never be trained.
-    with torch.inference_mode(False), torch.random.fork_rng(devices):
-        proxy = proxy_for(adapted, config)
-        complete = adapted if isinstance(adapted, TracesLight) else ForeignHost(adapted, borrowed, proxy)
-        attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
-    if config.known_map is not None:
-        attached.model.light.show(read_environment(Path(config.known_map)))
-    log.warning("NeILF++ attached to %s: %s", host_name(adapted), _attachment_summary(attached, borrowed))
-    return attached
+    return SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
 
 
 def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:

@@ -6,7 +6,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
@@ -17,14 +18,8 @@ from neilfpp_method import losses
 from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
-from neilfpp_method.incident import (
-    Sources,
-    arriving,
-    incident_radiance,
-    scene_tracer,
-    trace_light,
-)
-from neilfpp_method.lighting.replay import Replay
+from neilfpp_method.incident import Sources, arriving, incident_radiance, scene_tracer, trace_light
+from neilfpp_method.lighting.replay import PointReplay
 from neilfpp_method.lighting.solver import LightSolver, make_light_solver
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, StageTable, active_losses
 from neilfpp_method.settings.check import check_config
@@ -103,15 +98,14 @@ class NeilfModel(nn.Module):
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         # The light starts at the radiance under which the initial material has the images' median radiance.
-        albedo = initial_albedo(
-            config.brdf.initial_base_color, config.brdf.initial_metallic, _specular_lobe(config.shading)
-        )
+        first, lobe = config.brdf, _specular_lobe(config.shading)
+        albedo = initial_albedo(first.initial_base_color, first.initial_metallic, lobe)
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
         # The trainer of a borrowed host may move its surface in any step, so no point is reused.
         surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
-        self.replay = Replay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
+        self.replay = PointReplay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
         """Switch to other settings. Effects may change; the sizes of the fields must not."""
@@ -119,6 +113,16 @@ class NeilfModel(nn.Module):
         self.lobe = _specular_lobe(config.shading)
         self.brdf.use(config.brdf)
         LightModel(self.light, self.lamps).use(config.light)
+
+    @contextmanager
+    def evaluating(self) -> Iterator[None]:
+        """Evaluation mode within the context."""
+        mode = self.training
+        self.eval()
+        try:
+            yield
+        finally:
+            self.train(mode)
 
     # ----------------------------------------------------------------------------------------------- one step
 
@@ -226,12 +230,10 @@ class NeilfModel(nn.Module):
     @timed("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
         """Surface points to shade; the gradients of position and normal are scaled by the settings."""
-        settings = self.config.loss
+        settings, normal = self.config.loss, self.shading_normals(hits.position, hits.normal)
         return SurfacePixels(
             position=losses.scale_gradient(hits.position, settings.position_gradient),
-            normal=losses.scale_gradient(
-                self.shading_normals(hits.position, hits.normal), settings.normal_gradient
-            ),
+            normal=losses.scale_gradient(normal, settings.normal_gradient),
             wo=-pixels.directions,
             pixel=pixels.color,
             image_gradient=pixels.image_gradient,
@@ -244,7 +246,7 @@ class NeilfModel(nn.Module):
         """The material of surface points, and its active priors L_smth and L_Lam."""
         priors = {}
         if "smoothness" in active:
-            with timed("regularisers"):
+            with timed("regularizers"):
                 sample = self.brdf.with_gradients(surface.position)
             material = sample.material
             priors["smoothness"] = losses.smoothness(
@@ -274,9 +276,7 @@ class NeilfModel(nn.Module):
     @timed("tracing")
     def _inter_reflection(self, position: Float[Tensor, "P 3"], normal: Float[Tensor, "P 3"]) -> LossTerm:
         """L_ref on random rays from surface points, at those that hit the scene."""
-        traced = trace_light(
-            self.host, position, normal, self.config.inter_reflection, self.config.shading.hit_share
-        )
+        traced = trace_light(self.host, position, normal, self.config)
         rows = torch.nonzero(traced.hit)[:, 0]
         incident = self.light.radiance(traced.position[rows], traced.wi[rows][:, None])[:, 0]
         return losses.inter_reflection(
@@ -295,7 +295,7 @@ class NeilfModel(nn.Module):
         """Traces light between surfaces of the scene; None unless inter-reflection is hard."""
         if self.config.inter_reflection.mode != "hard":
             return None
-        return scene_tracer(self.host, self.config.inter_reflection, self.config.shading.hit_share)
+        return scene_tracer(self.host, self.config.ray_offset, self.config.shading.hit_share)
 
     @property
     def sources(self) -> Sources:

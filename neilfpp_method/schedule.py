@@ -36,6 +36,7 @@ __all__ = [
     "StageTable",
     "Total",
     "active_losses",
+    "learning_rate",
     "rate_factor",
     "stage_at",
     "stage_steps",
@@ -62,10 +63,11 @@ EXPOSURE_PRIOR = 0.1
 nearly undetermined: R, which depends on the direction, can compensate a gain that all pixels of a view share.
 """
 
-MATERIAL_LOSSES = {name: name for name in ("inter_reflection", "smoothness", "lambertian")}
-"""Losses of the material stages, with the settings that hold their weights relative to L_phys, whose weight
-is 1.
-"""
+INTER_REFLECTION = 0.1
+"""Weight of L_ref in the material stages, relative to L_phys, whose weight is 1 (published code)."""
+
+MATERIAL_LOSSES = {name: name for name in ("smoothness", "lambertian")}
+"""Priors of the material stages, with the settings that hold their weights."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,8 @@ class StagePlan:
     """One row of a stage table.
 
     Attributes:
-        weights: for each loss of the stage, the name of the setting in `LossConfig` that holds its weight.
+        weights: for each loss whose weight is a setting, the name of that setting in `LossConfig`. The
+            weights of the other losses are fixed (`active_losses`).
         moves: parameter groups that the stage trains.
         grows: for each loss whose weight changes during the stage, the setting with the factor by which it
             has changed at the end of the stage.
@@ -232,6 +235,17 @@ def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
     return first * (config.beta_final / first) ** share
 
 
+def learning_rate(config: OptimizerConfig, field: str) -> float:
+    """Learning rate of a field before warm-up and decay.
+
+    The background learns at the rate of R. A field with another name, as a host of another project may have
+    one, learns at the rate of the geometry.
+    """
+    if field == "background":
+        return config.radiance
+    return getattr(config, field) if field in GEOMETRY | MATERIAL else config.geometry
+
+
 def active_losses(
     stage: Stage, config: NeilfConfig, stages: StageTable = STAGES, share: float = 0.0
 ) -> Mapping[str, float]:
@@ -252,10 +266,10 @@ def active_losses(
     }
     if plan.moves_material:
         weights["physical"] = 1.0
+        if config.inter_reflection.mode == "soft":
+            weights["inter_reflection"] = INTER_REFLECTION
     if config.optimizer.exposure > 0 and "volume" in weights:
         weights["exposure"] = EXPOSURE_PRIOR
-    if config.inter_reflection.mode != "soft":
-        weights.pop("inter_reflection", None)
     if not config.shading.specular:
         # A Lambertian surface has neither roughness nor metallic, on which these losses act.
         for loss in ("smoothness", "lambertian"):

@@ -18,7 +18,7 @@ from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.settings.types import MapLightConfig
+from neilfpp_method.settings.types import MapLightConfig, MeshConfig, NeilfConfig
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.optimizer import make_optimizer
 from tests.scenes import sphere_batch, sphere_model, tiny_config
@@ -139,11 +139,16 @@ class Room:
         return SurfaceHits(position / 2.0, position, -position / 2.0, ones, ones)
 
 
+def with_rays_per_point(count: float) -> NeilfConfig:
+    settings = tiny_config()
+    rays = dataclasses.replace(settings.inter_reflection, rays_per_point=count)
+    return dataclasses.replace(settings, inter_reflection=rays)
+
+
 def test_traced_light_is_the_radiance_of_the_wall():
     torch.manual_seed(0)
     position, normal = torch.zeros(500, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(500, 3)
-    settings = dataclasses.replace(tiny_config().inter_reflection, rays_per_point=2.5, offset=1e-4)
-    traced = trace_light(Room(), position, normal, settings, hit_share=0.8)
+    traced = trace_light(Room(), position, normal, with_rays_per_point(2.5))
     assert len(traced.wi) == 1250  # each point twice, and half of them once more
     torch.testing.assert_close(traced.radiance, traced.wi, atol=1e-3, rtol=0.0)
     cosine = traced.wi[:, 2]
@@ -168,10 +173,10 @@ class Recorder(Room):
 
 
 def test_a_ray_starts_further_out_at_grazing_angles_and_for_thicker_layers():
-    host, settings = Recorder(0.003), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
+    host, settings = Recorder(0.003), with_rays_per_point(1.0)
     normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(200, 3)
-    trace_light(host, torch.zeros(200, 3), normal, settings, 0.8)
-    torch.testing.assert_close(host.rays.origins[:, 2], torch.full((200,), settings.offset + 4 * 0.003))
+    trace_light(host, torch.zeros(200, 3), normal, settings)
+    torch.testing.assert_close(host.rays.origins[:, 2], torch.full((200,), settings.ray_offset + 4 * 0.003))
     assert host.rays.origins.norm(dim=-1).max() > 2.0 * host.rays.origins.norm(dim=-1).min()
 
 
@@ -180,11 +185,11 @@ def test_no_ray_starts_further_out_than_the_published_bound():
     would start a ray within the layer.
     """
     torch.manual_seed(0)
-    host, settings = Recorder(0.03), dataclasses.replace(tiny_config().inter_reflection, rays_per_point=1.0)
+    host, settings = Recorder(0.03), with_rays_per_point(1.0)
     normal = torch.tensor([[0.0, 0.0, 1.0]]).expand(500, 3)
-    traced = trace_light(host, torch.zeros(500, 3), normal, settings, 0.8)
+    traced = trace_light(host, torch.zeros(500, 3), normal, settings)
     assert host.rays.origins.norm(dim=-1).max() <= 0.2
-    steepest = (settings.offset + 4 * 0.03) / 0.2
+    steepest = (settings.ray_offset + 4 * 0.03) / 0.2
     assert traced.wi[:, 2].min().item() == pytest.approx(steepest, abs=0.02)
     assert len(traced.wi) == pytest.approx(500 * (1 - steepest) / (1 - math.cos(math.radians(80))), rel=0.15)
 
@@ -206,18 +211,17 @@ def test_a_light_without_color_is_compared_by_luminance():
     assert model._inter_reflection(at, at / 0.6).mean() < 1e-6
 
 
-def test_the_gradient_into_outgoing_radiance_is_scaled():
+def test_the_gradient_into_outgoing_radiance_is_scaled(monkeypatch):
+    """R of recovered geometry gets none, and R of a mesh a share of it."""
     batch = sphere_batch()
     config = tiny_config()
+    # Every ray counts as a hit.
+    config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.0))
     gradients = {}
-    for scale in (0.0, 0.35, 0.7):
-        model = sphere_model(
-            dataclasses.replace(
-                config,
-                inter_reflection=dataclasses.replace(config.inter_reflection, radiance_gradient=scale),
-                shading=dataclasses.replace(config.shading, hit_share=0.0),  # every ray counts as a hit
-            )
-        )
+    for host, scale in ((config.host, 0.0), (MeshConfig(), 0.35), (MeshConfig(), 0.7)):
+        monkeypatch.setattr("neilfpp_method.incident.traced.RADIANCE_GRADIENT", scale)
+        model = sphere_model(config)
+        model.use(dataclasses.replace(config, host=host))
         torch.manual_seed(3)
         hits = model.host.render(batch.rays).detach()
         term = model._inter_reflection(hits.position, hits.normal)
@@ -276,7 +280,7 @@ class HalfRoom(Room):
 
 def test_hard_inter_reflection_uses_the_scene_for_hits_and_the_light_otherwise():
     config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
+    hard = dataclasses.replace(config.inter_reflection, mode="hard")
     distant = MapLightConfig(kind="distant")
     config = dataclasses.replace(config, inter_reflection=hard, light=distant)
     model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant"))
@@ -351,7 +355,7 @@ def test_every_light_works_with_every_sampler(kind, sampler):
 
 def test_a_lamp_lights_only_unoccluded_points():
     config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard", offset=1e-4)
+    hard = dataclasses.replace(config.inter_reflection, mode="hard")
     light = MapLightConfig(kind="auto", environment_height=8)
     config = dataclasses.replace(config, inter_reflection=hard, light=light)
     model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant")).eval()

@@ -13,6 +13,7 @@ from neilfpp_method.schedule import (
     Stage,
     StagePosition,
     active_losses,
+    learning_rate,
     rate_factor,
     stage_at,
     surface_width_limit,
@@ -56,6 +57,15 @@ def test_the_weight_of_the_hessian_grows_only_in_sdf_init():
 
 def factors(config: OptimizerConfig, stage: Stage, steps: list[int], length: int) -> list[float]:
     return [rate_factor(config, StagePosition(stage, step, length)) for step in steps]
+
+
+def test_every_field_has_a_learning_rate():
+    """A host of another project may have fields with any name, also that of another setting."""
+    config = OptimizerConfig(geometry=1e-2, radiance=2e-2, brdf=3e-2)
+    rates = {
+        name: learning_rate(config, name) for name in ("brdf", "radiance", "background", "hair", "joint")
+    }
+    assert rates == {"brdf": 3e-2, "radiance": 2e-2, "background": 2e-2, "hair": 1e-2, "joint": 1e-2}
 
 
 def test_rates_decrease_smoothly_or_in_drops():

@@ -23,7 +23,7 @@ from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import camera_rays, project
 from neilfpp_method.errors import UserError
-from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, pixel_batch
+from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, to_pixel_batch
 from neilfpp_method.plugin.dataparser import CaptureParserConfig, capture_of
 from neilfpp_method.train.optimizer import seed_step
 from tests.data.formats.scenes import POINTS, material
@@ -71,7 +71,7 @@ def test_each_drawn_pixel_has_its_color_and_loss_inputs(root: Path) -> None:
         dataparser=CaptureParserConfig(data=root), train_num_rays_per_batch=400
     ).setup()
     rays, batch = manager.next_train(0)
-    drawn = pixel_batch(rays.origins, rays.directions, batch)
+    drawn = to_pixel_batch(rays.origins, rays.directions, batch)
     whole = PixelDataset(load_capture(root), load_capture(root).train_views)
     camera, row, column = batch["indices"].unbind(-1)
     index = row * WIDTH + column
@@ -94,7 +94,7 @@ def test_a_step_uses_the_pixels_of_the_same_step_of_the_standalone_loop(root: Pa
         rays, batch = manager.next_train(step)
         seed_step(7, step)
         expected = whole.sample(64)
-        drawn = pixel_batch(rays.origins, rays.directions, batch)
+        drawn = to_pixel_batch(rays.origins, rays.directions, batch)
         assert torch.equal(drawn.color, expected.color)
         assert torch.equal(drawn.view, expected.view)
         assert torch.equal(drawn.origins, expected.origins)
@@ -116,7 +116,9 @@ def test_invalid_pixels_are_not_drawn(tmp_path: Path) -> None:
         seed_step(7, step)
         rays, batch = manager.next_train(step)
         seed_step(7, step)
-        assert torch.equal(pixel_batch(rays.origins, rays.directions, batch).color, whole.sample(400).color)
+        assert torch.equal(
+            to_pixel_batch(rays.origins, rays.directions, batch).color, whole.sample(400).color
+        )
         assert (batch["indices"][:, 2] >= 9).all()
 
 

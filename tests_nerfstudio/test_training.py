@@ -49,8 +49,8 @@ FIELDS = {
     "light": "light.",
 }
 SETTINGS = small_settings()
-# L_ref with a gradient into R, which nevertheless is not trained in material init.
-L_REF = dataclasses.replace(SETTINGS.inter_reflection, radiance_gradient=1.0, rays_per_point=4.0)
+# L_ref on many rays, so that every step has some that hit.
+L_REF = dataclasses.replace(SETTINGS.inter_reflection, rays_per_point=4.0)
 FREE = free_light(dataclasses.replace(SETTINGS, inter_reflection=L_REF))
 
 

@@ -61,7 +61,7 @@ def run(options: Render) -> None:
         terminal().print(size, soft_wrap=True)
     if "maps" in options.what:
         with computing_fast(), progress_bar("rendering") as advance:
-            render_run(run, out, options.views, options.overwrite, options.confidence, advance)
+            render_run(run, out, (options.views,), options.overwrite, options.confidence, advance)
     if (
         "light" in options.what
         and not write_light_picture(run, out / "incident_light.png")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from neilfpp_method.compare.contenders import Contender
-from neilfpp_method.compare.parts import Part, Row
-from neilfpp_method.evaluate.glossary import explain
+from neilfpp_method.compare.parts import Part, TableRow
+from neilfpp_method.evaluate.glossary import style_of
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.report.measured import OWN, Measured
 
@@ -33,14 +33,14 @@ def figures_parts(runs: Sequence[Contender], other_capture: frozenset[int]) -> l
     ]
 
 
-def figure_rows(figures: Sequence[Mapping[str, float]]) -> tuple[Row, ...]:
+def figure_rows(figures: Sequence[Mapping[str, float]]) -> tuple[TableRow, ...]:
     """Build one row for each figure that at least one run has."""
     rows = []
     for name in dict.fromkeys(name for column in figures for name in column):
-        entry = explain(name)
+        style = style_of(name)
         values = tuple(column.get(name) for column in figures)
-        texts = tuple("–" if value is None else entry.format(value) for value in values)
-        rows.append(Row(name, entry.title, values, texts, entry.better))
+        texts = tuple("–" if value is None else style.format(value) for value in values)
+        rows.append(TableRow(name, style.title, values, texts, style.better))
     return tuple(rows)
 
 

@@ -13,13 +13,13 @@ from neilfpp_method.report.files import flat_settings
 from neilfpp_method.report.tables import STAGE_TITLES
 from neilfpp_method.settings.plain import to_dict
 
-__all__ = ["Part", "Row", "runs_part", "seconds_part", "settings_part"]
+__all__ = ["Part", "TableRow", "runs_part", "seconds_part", "settings_part"]
 
 Value = float | str | None
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A row of the table.
 
     Attributes:
@@ -53,7 +53,7 @@ class Part:
     kind: Literal["runs", "settings", "seconds", "figures"]
     name: str
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     apart: frozenset[int] = frozenset()
     notes: tuple[str, ...] = ()
 
@@ -142,11 +142,11 @@ def _machine(run: Contender) -> str:
     return f"{' and '.join(devices)}, {machine.get('threads')} threads" if machine else "an unknown machine"
 
 
-def _text_row(key: str, title: str, values: Sequence[Any]) -> Row:
+def _text_row(key: str, title: str, values: Sequence[Any]) -> TableRow:
     texts = tuple(None if value is None else str(value) for value in values)
-    return Row(key, title, texts, tuple("–" if text is None else text for text in texts))
+    return TableRow(key, title, texts, tuple("–" if text is None else text for text in texts))
 
 
-def _seconds_row(key: str, title: str, values: Sequence[float | None]) -> Row:
+def _seconds_row(key: str, title: str, values: Sequence[float | None]) -> TableRow:
     texts = tuple("–" if value is None else f"{value:.1f}" for value in values)
-    return Row(key, title, tuple(values), texts, better="lower")
+    return TableRow(key, title, tuple(values), texts, better="lower")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from neilfpp_method.evaluate.panels import ComparedMap
-from neilfpp_method.evaluate.pictures import Group, Row, Section, contact_sheet
+from neilfpp_method.evaluate.pictures import Group, PictureRow, Section, contact_sheet
 from neilfpp_method.report.views import title_of
 
 __all__ = ["Column", "comparison_sheet", "shortened"]
@@ -55,7 +55,7 @@ def shortened(label: str) -> str:
     return f"{label[: MAX_LABEL - end - 1]}…{label[-end:]}"
 
 
-def _row(title: str, maps: Sequence[ComparedMap | None], view: int) -> Row:
+def _row(title: str, maps: Sequence[ComparedMap | None], view: int) -> PictureRow:
     comparisons = [None if m is None else m.comparisons[view] for m in maps]
     truth = next((c.truth for c in comparisons if c is not None and c.truth is not None), None)
     note = next(m.note for m in maps if m is not None)
@@ -64,4 +64,4 @@ def _row(title: str, maps: Sequence[ComparedMap | None], view: int) -> Row:
         note = "scaled per channel\nto fit the truth"
     # The note repeats what follows a comma in the title.
     short_title = title.split(", ", 1)[0]
-    return Row(short_title, (truth, *(None if c is None else c.estimate for c in comparisons)), note)
+    return PictureRow(short_title, (truth, *(None if c is None else c.estimate for c in comparisons)), note)

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from rich.table import Table
 from rich.text import Text
 
-from neilfpp_method.compare.parts import Part, Row
-from neilfpp_method.compare.write import Comparison
+from neilfpp_method.compare.parts import Part, TableRow
+from neilfpp_method.compare.write import RunComparison
 
 __all__ = ["tables_of"]
 
@@ -22,7 +22,7 @@ WIDEST = 28
 """Largest width of a column, characters; longer texts are wrapped."""
 
 
-def tables_of(comparison: Comparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]:
+def tables_of(comparison: RunComparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]:
     """Yield title, table and notes of each part. The best value among comparable figures is bold."""
     texts = [[*comparison.labels], *(row.texts for part in comparison.parts for row in part.rows)]
     widths = [min(max(map(len, column)) + len(MARK), WIDEST) for column in zip(*texts, strict=True)]
@@ -38,14 +38,14 @@ def tables_of(comparison: Comparison) -> Iterator[tuple[str, Table, tuple[str, .
         yield part.title, table, part.notes
 
 
-def _cells(part: Part, row: Row) -> Iterator[Text]:
+def _cells(part: Part, row: TableRow) -> Iterator[Text]:
     best = _best(part, row)
     for i, text in enumerate(row.texts):
         mark = MARK if i in part.apart and row.values[i] is not None else ""
         yield Text(text + mark, style="bold" if i in best else "")
 
 
-def _best(part: Part, row: Row) -> set[int]:
+def _best(part: Part, row: TableRow) -> set[int]:
     """Indices of the comparable runs with the best value; empty if fewer than two values differ."""
     values = {
         i: value

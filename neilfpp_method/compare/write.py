@@ -22,13 +22,13 @@ from neilfpp_method.compare.figures import SHOWN, figure_rows, figures_parts
 from neilfpp_method.compare.parts import Part, runs_part, seconds_part, settings_part
 from neilfpp_method.compare.sheet import Column, comparison_sheet
 from neilfpp_method.data.images import replacing, write_png
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.views import ComparedViews, compare_views
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_writable
 from neilfpp_method.train.run import load_run
 
-__all__ = ["FILES", "Comparison", "compare_runs"]
+__all__ = ["FILES", "RunComparison", "compare_runs"]
 
 FILES = ("compare.json", "compare.csv", "compare.png")
 FORMAT = 1
@@ -40,7 +40,7 @@ MIN_SIZE, MAX_SIZE = 16, 2048
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RunComparison:
     """The result of a comparison: a label per run, the parts of the table, notes, and the files written."""
 
     labels: tuple[str, ...]
@@ -56,7 +56,7 @@ def compare_runs(
     size: int,
     device: str,
     on_progress: Callable[[float], None] = lambda share: None,
-) -> Comparison:
+) -> RunComparison:
     """Compare runs, and write the table and the image.
 
     Args:
@@ -83,7 +83,7 @@ def compare_runs(
     if rendered:
         parts.append(_rendered_part(runs, common, rendered))
     parts.append(seconds_part(runs))
-    comparison = Comparison(tuple(run.label for run in runs), tuple(parts), common.notes, ())
+    comparison = RunComparison(tuple(run.label for run in runs), tuple(parts), common.notes, ())
     return replace(comparison, files=_write(comparison, out, common, runs, rendered))
 
 
@@ -120,7 +120,7 @@ def _rendered_part(runs: Sequence[Contender], common: Common, rendered: Mapping[
 
 
 def _write(
-    comparison: Comparison,
+    comparison: RunComparison,
     out: Path,
     common: Common,
     runs: Sequence[Contender],
@@ -140,7 +140,7 @@ def _write(
     return (json_file, csv_file, image_file) if rendered else (json_file, csv_file)
 
 
-def _plain(comparison: Comparison, common: Common) -> dict[str, Any]:
+def _plain(comparison: RunComparison, common: Common) -> dict[str, Any]:
     """The table as plain values for JSON; numbers are not rounded."""
     parts = [
         {
@@ -169,7 +169,7 @@ def _plain(comparison: Comparison, common: Common) -> dict[str, Any]:
     }
 
 
-def _csv(comparison: Comparison) -> str:
+def _csv(comparison: RunComparison) -> str:
     """The table as CSV: one line per row with kind, protocol, key, and a value for each run.
 
     In a part of figures, the line `comparable` says whether they can be compared with the first run's.

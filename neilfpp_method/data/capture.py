@@ -7,7 +7,7 @@ loaded.
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -104,6 +104,23 @@ class Capture:
     def test_views(self) -> tuple[View, ...]:
         """The test views, in order."""
         return tuple(view for view in self.views if view.name in self.test)
+
+    def chosen_views(self, words: Sequence[str]) -> tuple[View, ...]:
+        """The views with these names, in order; "test", "train" and "all" stand for groups of views.
+
+        Raises:
+            UserError: a word is neither a group nor the name of a view, or a group is empty.
+        """
+        groups = {"test": self.test_views, "train": self.train_views, "all": self.views}
+        names = {view.name: (view,) for view in self.views}
+        for word in words:
+            if word in groups and not groups[word]:
+                raise UserError(f"{self.root}: there is no {word} view", "give all, or names of views")
+            if word not in groups and word not in names:
+                remedy = f"give test, train, all, or names of views, such as {self.views[0].name}"
+                raise UserError(f"{self.root}: there is no view '{word}'", remedy)
+        chosen = {view.name for word in words for view in (groups.get(word) or names[word])}
+        return tuple(view for view in self.views if view.name in chosen)
 
     def scene_camera(self, view: View) -> Camera:
         """The camera of a view in the scene frame."""

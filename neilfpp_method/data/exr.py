@@ -97,7 +97,7 @@ def exr_samples(path: Path) -> Float32[np.ndarray, "H W C"]:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ImageChannels:
     """The index of a part, and the names of its channels that are the image, with alpha last."""
 
     part: int
@@ -111,7 +111,7 @@ def _part_name(part: OpenEXR.Part) -> str:
 
 def _picture(
     path: Path, parts: Sequence[Sequence[str] | Mapping[str, object]], part_names: Sequence[str]
-) -> Picture:
+) -> ImageChannels:
     layers = {layer for names in parts for layer in _layers(names)}
     main = [layer for layer in layers if _is_main(layer)]
     (layer,) = main if len(main) == 1 else layers if len(layers) == 1 else ("",)
@@ -125,7 +125,7 @@ def _picture(
         for part in sorted(range(len(parts)), key=lambda i: not _is_main(part_names[i])):
             names = parts[part]
             if set(channels) <= set(names) and CHROMA not in names:
-                return Picture(part, channels + ((prefix + ALPHA,) if prefix + ALPHA in names else ()))
+                return ImageChannels(part, channels + ((prefix + ALPHA,) if prefix + ALPHA in names else ()))
     listed = ", ".join(name for names in parts for name in sorted(names))
     raise UserError(f"{path}: no RGB or single channel among {listed}", "store the image as R, G, B")
 

@@ -98,6 +98,11 @@ class Entry:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write an object atomically; numbers that are not finite raise a `ValueError`, as JSON has none."""
+    """Write an object atomically.
+
+    Raises:
+        UserError: the file cannot be written.
+        ValueError: a number is not finite, which JSON does not have.
+    """
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n", "utf-8")
+        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n", "utf-8")

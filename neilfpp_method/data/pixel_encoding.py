@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
-__all__ = ["BYTES", "ENCODINGS", "Encoded", "Encoding", "encodings_for"]
+__all__ = ["BYTES", "ENCODINGS", "EncodedView", "Encoding", "encodings_for"]
 
 MAX_VALUE = 32_768.0
 """Largest encoded value of a view in half precision, whose largest number is 65 504."""
@@ -26,7 +26,7 @@ MEDIAN_SAMPLES = 2**20
 
 
 @dataclass(frozen=True)
-class Encoded:
+class EncodedView:
     """Codes of a view, and its factor `scale`, by which decoded values are divided."""
 
     codes: Shaped[np.ndarray, "H W 3"]
@@ -45,7 +45,7 @@ class Encoding:
 
     name: str
     dtype: np.dtype
-    encode: Callable[[Float32[np.ndarray, "H W 3"]], Encoded | None]
+    encode: Callable[[Float32[np.ndarray, "H W 3"]], EncodedView | None]
 
     def decode(
         self, codes: Shaped[np.ndarray, "*shape 3"], scale: float | Float[np.ndarray, "*shape"]
@@ -60,18 +60,18 @@ def _levels(bits: int) -> Encoding:
     dtype = np.dtype(f"uint{bits}")
     full = np.float32(np.iinfo(dtype).max)
 
-    def encode(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
+    def encode(color: Float32[np.ndarray, "H W 3"]) -> EncodedView | None:
         codes = np.rint(color * full)
         # 8 bits must be exact; 16 bits may round to the nearest level.
         lost = 1e-6 if bits == 8 else 0.51 / full
         if codes.max(initial=0) > full or np.abs(codes / full - color).max(initial=0) > lost:
             return None
-        return Encoded(codes.astype(dtype), 1.0)
+        return EncodedView(codes.astype(dtype), 1.0)
 
     return Encoding(f"uint{bits}", dtype, encode)
 
 
-def _half(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
+def _half(color: Float32[np.ndarray, "H W 3"]) -> EncodedView | None:
     brightest = float(color.max(initial=0.0))
     scale = 2.0 ** math.floor(math.log2(MAX_VALUE / brightest)) if brightest > 0 else 1.0
     some = color.reshape(-1)[:: -(-color.size // MEDIAN_SAMPLES)]
@@ -79,11 +79,11 @@ def _half(color: Float32[np.ndarray, "H W 3"]) -> Encoded | None:
     too_dark = len(positive) > 0 and float(np.median(positive)) * scale < MIN_MEDIAN
     if len(positive) and (too_dark or not np.isfinite(np.float32(scale))):
         return None
-    return Encoded((color * np.float32(scale)).astype(np.float16), scale)
+    return EncodedView((color * np.float32(scale)).astype(np.float16), scale)
 
 
 HALF = Encoding("float16", np.dtype(np.float16), _half)
-FLOAT = Encoding("float32", np.dtype(np.float32), lambda color: Encoded(color, 1.0))
+FLOAT = Encoding("float32", np.dtype(np.float32), lambda color: EncodedView(color, 1.0))
 BYTES, WORDS = _levels(8), _levels(16)
 ENCODINGS = {encoding.name: encoding for encoding in (BYTES, WORDS, HALF, FLOAT)}
 

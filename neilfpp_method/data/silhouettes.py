@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.views import Camera, View, project
 
-__all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "Sightings", "agreement", "read_outlines", "sightings"]
+__all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "SilhouetteCounts", "agreement", "read_outlines", "sightings"]
 
 AGREEMENT = 0.9
 """Smallest share of the views that see a point whose silhouettes must contain it."""
@@ -74,14 +74,14 @@ def _of_size(camera: Camera, height: int, width: int) -> Camera:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class SilhouetteCounts:
     """For each of P points, the number of views that see it and the number of silhouettes that contain it."""
 
     visible_in: Int64[np.ndarray, " P"]
     inside: Int64[np.ndarray, " P"]
 
 
-def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Sightings:
+def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> SilhouetteCounts:
     """Count views and silhouettes for points in the frame of the cameras."""
     visible_in, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for outline in outlines:
@@ -96,7 +96,7 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
         column, row = np.where(in_image[:, None], pixel, 0).astype(np.int64).T
         visible_in += in_image | outline.complete
         inside += in_image & outline.inside[row, column]
-    return Sightings(visible_in, inside)
+    return SilhouetteCounts(visible_in, inside)
 
 
 def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:

@@ -7,7 +7,7 @@ Cameras have OpenCV axes (x right, y down, z forward). The centre of pixel (colu
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -333,8 +333,8 @@ class CameraRays:
         return plane
 
 
-def _shape(camera: Camera) -> tuple[Lens | None, float, float, float, float, int, int]:
-    """All properties of a camera except its pose."""
+def _shape(camera: Camera) -> Hashable:
+    """A key of everything about a camera except its pose."""
     return (camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 

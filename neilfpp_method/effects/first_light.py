@@ -30,6 +30,8 @@ from neilfpp_method.effects.place_fit import (
     place_errors,
     seconds_of_step,
 )
+from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material, Observed
 
@@ -50,8 +52,6 @@ LAMP_PIXELS = 4096
 """
 CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
-
-
 LOBE_FITS = 3.6
 """Time of the evidence for the lobe in units of a fit to all pixels: four pairs of fits to three quarters of
 them, each with half the usual number of rounds.
@@ -113,8 +113,7 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
         The initial light; None if there are fewer than `MIN_PLACES` places.
     """
     places = data.places
-    numbers = places.place.unique()
-    if len(numbers) < MIN_PLACES:
+    if places.shown < MIN_PLACES:
         return None
     split = data.hold_back(0, FOLDS)
     fits = {FIRST_SCALE: fit_places(split.known, Permitted(metals, FIRST_SCALE))}
@@ -129,7 +128,7 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
         return fit_places(changed, Permitted(metals, scale), start, CARRIED_ROUNDS)
 
     best = fit_on(data)
-    materials = best.material(numbers)
+    materials = best.material(places.place.unique())
     mean = Material(
         materials.base_color.log().mean(0, keepdim=True).exp(),
         materials.roughness.mean(0, keepdim=True),
@@ -142,7 +141,7 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
         mean=mean,
         errors=errors,
         scale=scale,
-        places=len(numbers),
+        places=places.shown,
         observed=places.observed[drawn],
         material=Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic),
         lamp_trial=LampTrial(split, fit_on),
@@ -166,8 +165,12 @@ def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -
 
 
 @torch.no_grad()
-def start_with(model: NeilfModel, found: FirstLight) -> None:
-    """Set the light of a model, and the initial material of its untrained BRDF field."""
+def start_with(model: NeilfModel, solver: LightSolver, found: FirstLight) -> Evidence | None:
+    """Set the light of a model and the initial material of its untrained BRDF field, and look for lamps.
+
+    Returns:
+        The evidence for lamps, as `LightSolver.start` returns it.
+    """
     log_radiance = found.log_radiance
     model.light.resample(
         log_radiance.mean(0, keepdim=True).expand_as(log_radiance)
@@ -175,6 +178,7 @@ def start_with(model: NeilfModel, found: FirstLight) -> None:
         else log_radiance
     )
     model.brdf.start_at(found.mean)
+    return solver.start(found.observed, found.material, model.scene, found.lamp_trial)
 
 
 def _rescaled(fits: Mapping[float, PlaceFit], scale: float) -> PlaceFit:

@@ -105,7 +105,7 @@ class PlaceSolver(nn.Module):
         If there are too few places, the first fit starts from an even light.
         """
         places = self.places()
-        if model.lobe is None or len(places.place.unique()) < MIN_PLACES:
+        if model.lobe is None or places.shown < MIN_PLACES:
             return
         rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
         self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")
@@ -114,5 +114,4 @@ class PlaceSolver(nn.Module):
         first = find_first_light(data, model.brdf.metals)
         if first is not None:
             self.say(first.summary())
-            start_with(model, first)
-            light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
+            start_with(model, light_solver, first)

@@ -48,6 +48,11 @@ class Places:
     view: Int[Tensor, " N"]
     observed: Observed
 
+    @property
+    def shown(self) -> int:
+        """Number of places that have pixels."""
+        return len(self.place.unique())
+
     def where(self, rows: Tensor) -> Places:
         """The same places with only some of the pixels."""
         return Places(self.count, self.place[rows], self.view[rows], self.observed[rows])

@@ -126,45 +126,42 @@ def review_light(
 
     The model uses the settings of the plan afterwards. The arguments are those of `review_surface`, and
     `most`, the maximum number of pixels of the places; below `MIN_PIXELS` nothing is measured.
-
     """
     if len(pixels.views) < MIN_TRAIN_VIEWS:
         return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views")
     if most < MIN_PIXELS:
         return _not_measured(plan, step, "the budget leaves no time for it")
     places = light_places(model, pixels, most)
-    mode = model.training
-    model.eval()
-    typical, decisions = model.facts.median_radiance, []
-    if len(places.place.unique()) < MIN_PLACES:
-        model.train(mode)
+    if places.shown < MIN_PLACES:
         return _not_measured(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
+    with model.evaluating():
+        return _review_light_at(places, plan, model, step)
+
+
+def _review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) -> LightReview:
+    """`review_light` at given places, with the model in evaluation mode."""
+    typical, decisions, first = model.facts.median_radiance, [], None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step))
         model.use(plan.config)
-    first = None
     if model.lobe is not None:
         data = PlaceData(places, place_transport(places, model.lobe, model.scene), typical)
         if plan.is_open("metals") and model.brdf.metals:
             decisions.append(plan.decide("metals", metals_evidence(data), step))
             model.use(plan.config)
         first = find_first_light(data, model.brdf.metals)
-    model.train(mode)
     return LightReview(decisions, first)
 
 
 @torch.no_grad()
 def light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS) -> Places:
     """Places on the visible surface that several training views show, with at most `most` pixels."""
-    mode = model.training
-    model.eval()
-    surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-    count = min(PLACES, most // USUAL_VIEWS)
-    position, normal = surface.position[:count], surface.normal[:count]
-    places = gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
-    model.train(mode)
-    return places
+    with model.evaluating():
+        surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
+        count = min(PLACES, most // USUAL_VIEWS)
+        position, normal = surface.position[:count], surface.normal[:count]
+        return gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
 
 
 def improve_material(model: NeilfModel, places: Places) -> str | None:
@@ -177,7 +174,7 @@ def improve_material(model: NeilfModel, places: Places) -> str | None:
     Returns:
         One line for the console; None if there are fewer than `MIN_PLACES` places.
     """
-    if len(places.place.unique()) < MIN_PLACES:
+    if places.shown < MIN_PLACES:
         return None
     searched = search_materials(model, places)
     if searched.share > 0:
@@ -198,17 +195,15 @@ def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: in
     Returns:
         The new decisions.
     """
-    mode = model.training
-    model.eval()
-    rendered = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False))
-    surface = rendered.observed
     decisions = []
-    if plan.is_open("inter-reflection"):
-        measured = self_visibility(model, plan.settings.inter_reflection, surface.position, surface.normal)
-        decisions.append(plan.decide("inter-reflection", measured, step))
-    if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
-        decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))
-    model.train(mode)
+    with model.evaluating():
+        rendered = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False))
+        surface = rendered.observed
+        if plan.is_open("inter-reflection"):
+            measured = self_visibility(model, plan.settings, surface.position, surface.normal)
+            decisions.append(plan.decide("inter-reflection", measured, step))
+        if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
+            decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))
     return decisions
 
 
@@ -221,11 +216,9 @@ def review_material(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
     names = frozenset(name for name in JUDGED if plan.is_open(name))
     if not names:
         return []
-    mode = model.training
-    model.eval()
-    surface = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False)).observed
-    evidence = material_evidence(model, pixels, surface.position, surface.normal, names)
-    model.train(mode)
+    with model.evaluating():
+        surface = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False)).observed
+        evidence = material_evidence(model, pixels, surface.position, surface.normal, names)
     return [plan.decide(name, measured, step) for name, measured in evidence.items()]
 
 

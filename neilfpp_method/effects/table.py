@@ -10,7 +10,7 @@ from rich.table import Table
 from neilfpp_method.effects.catalogue import EFFECTS, switched
 from neilfpp_method.effects.plan import Plan
 
-__all__ = ["rows", "table"]
+__all__ = ["effects_table", "rows"]
 
 OPEN = "open"
 """Value of `decision` for an effect on which nothing has been decided yet."""
@@ -49,7 +49,7 @@ def rows(plan: Plan) -> list[dict[str, Any]]:
     return result
 
 
-def table(plan: Plan) -> Table:
+def effects_table(plan: Plan) -> Table:
     """A table of the effects for the terminal. From 80 columns on, lines break between words only."""
     result = Table(
         title=f"effects ({plan.request})", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0)

@@ -15,7 +15,7 @@ from torch import Tensor
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.incident.scene import off_surface, scene_tracer
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.settings.types import InterReflectionConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.sampling import cosine
 from neilfpp_method.structures import RayBatch
 
@@ -36,7 +36,7 @@ RAYS_AT_ONCE = 2048
 @torch.no_grad()
 def self_visibility(
     model: NeilfModel,
-    settings: InterReflectionConfig,
+    settings: NeilfConfig,
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
 ) -> Measurement:
@@ -44,7 +44,7 @@ def self_visibility(
 
     Args:
         model: its host traces the rays, or renders them if it cannot trace.
-        settings: settings of the rays; those of the model may have inter-reflection off.
+        settings: the settings under which rays are traced; the model's may have inter-reflection off.
         position: surface points that cameras see, scene frame.
         normal: unit normals at these points.
     """
@@ -54,19 +54,19 @@ def self_visibility(
 
 def blocked_share(
     model: NeilfModel,
-    settings: InterReflectionConfig,
+    settings: NeilfConfig,
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
 ) -> Float[Tensor, " N"]:
     """The occluded share of the hemisphere of each point. Arguments as in `self_visibility`."""
     drawn = cosine(normal).draw(DIRECTIONS, True)
     host, hit_share = model.host, model.config.shading.hit_share
-    if settings.mode == "hard":
-        hit = scene_tracer(host, settings, hit_share)(position, drawn).hit
+    if settings.inter_reflection.mode == "hard":
+        hit = scene_tracer(host, settings.ray_offset, hit_share)(position, drawn).hit
     else:
         start = position.repeat_interleave(DIRECTIONS, 0)
         up, directions = normal.repeat_interleave(DIRECTIONS, 0), drawn.reshape(-1, 3)
-        rays = RayBatch(off_surface(host, start, up, directions, settings.offset), directions)
+        rays = RayBatch(off_surface(host, start, up, directions, settings.ray_offset), directions)
         parts = [rays[i : i + RAYS_AT_ONCE] for i in range(0, len(rays), RAYS_AT_ONCE)]
         hit = torch.cat([host.render(part).is_hit(hit_share) for part in parts])
         hit = hit.view(len(position), DIRECTIONS)

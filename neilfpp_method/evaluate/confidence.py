@@ -10,7 +10,7 @@ The error model has two parts:
 
 An error that all points share is a scale of the base colour, which no image can determine and which is not
 counted. Each patch therefore contributes in proportion to the difference between the share of light that a
-point receives from it and the share that a typical point receives (`Evidence.typical`).
+point receives from it and the share that a typical point receives (`TrainingResiduals.typical`).
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
 __all__ = [
-    "Evidence",
+    "TrainingResiduals",
     "deviations_at",
-    "gather_evidence",
     "material_deviation",
+    "measure_residuals",
     "surface_at_pixels",
     "with_deviation",
 ]
@@ -57,7 +57,7 @@ the images do not determine.
 KNOWN = 0.05
 """Relative standard deviation of light from outside if the environment map was given."""
 PIXELS = 1024
-"""Number of training pixels from which `Evidence` is computed."""
+"""Number of training pixels from which `TrainingResiduals` are computed."""
 PRIOR_VIEWS = 1
 """Weight of the prior in `_birge_ratio`: this many views of typical error are added to the observed ones."""
 POINTS_AT_ONCE, SIGHTED_AT_ONCE = 512, 2**16
@@ -69,7 +69,7 @@ NEIGHBORS, NEAR, TURN = 9, 0.1, 0.1
 the distance, scene units, that one radian between two normals adds.
 """
 MIN_NOISE = 1e-3
-"""Lower bound of the relative errors in `Evidence`, so that a perfect fit does not divide by zero."""
+"""Lower bound of the measured relative errors, so that a perfect fit does not divide by zero."""
 STEP = 1e-3
 """Step, in display values, of the finite difference that gives the slope of radiance over display values."""
 TINY = 1e-9
@@ -77,7 +77,7 @@ TINY = 1e-9
 
 
 @dataclass(frozen=True)
-class Evidence:
+class TrainingResiduals:
     """Training views of a run and statistics of how well the run reproduces them.
 
     Attributes:
@@ -96,7 +96,7 @@ class Evidence:
 
 
 @torch.no_grad()
-def gather_evidence(run: Run) -> Evidence:
+def measure_residuals(run: Run) -> TrainingResiduals:
     """Load a run's training views and compare about `PIXELS` of their pixels with the rendering equation.
 
     If the run shows no surface in any training view, `noise` and `misfit` are 1: errors as large as the
@@ -128,15 +128,15 @@ def gather_evidence(run: Run) -> Evidence:
         parts = by_patch(incident.light, incident.patch, patch_count(model))
         shares.append(parts / parts.sum(-1, keepdim=True).clamp_min(TINY))
     if not errors:
-        return Evidence(views, 1.0, 1.0, views.centers.new_zeros(3, patch_count(model)))
+        return TrainingResiduals(views, 1.0, 1.0, views.centers.new_zeros(3, patch_count(model)))
     noise, misfit = (max(torch.cat(values).median().item(), MIN_NOISE) for values in (errors, misfits))
-    return Evidence(views, noise, misfit, torch.cat(shares).mean(0))
+    return TrainingResiduals(views, noise, misfit, torch.cat(shares).mean(0))
 
 
 @torch.no_grad()
 def material_deviation(
     model: NeilfModel,
-    evidence: Evidence,
+    residuals: TrainingResiduals,
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
     on_progress: Callable[[float], None] = lambda share: None,
@@ -145,7 +145,7 @@ def material_deviation(
 
     Args:
         model: the model, in evaluation mode.
-        evidence: evidence gathered from the model's run.
+        residuals: how well the model's run reproduces its training views (`measure_residuals`).
         position: points on the model's surface, scene frame.
         normal: unit normals, away from the surface.
         on_progress: called with the fraction of the work that is done.
@@ -159,22 +159,22 @@ def material_deviation(
     parts = [Deviation(*position.new_zeros(3, 0, 1))]
     for block in range(0, len(position), SIGHTED_AT_ONCE):
         end = min(block + SIGHTED_AT_ONCE, len(position))
-        block_sightings = evidence.views.sightings(model, position[block:end], normal[block:end], VIEWS)
+        block_sightings = residuals.views.sightings(model, position[block:end], normal[block:end], VIEWS)
         for start in range(block, end, POINTS_AT_ONCE):
             rows = slice(start, min(start + POINTS_AT_ONCE, end))
             sightings = block_sightings[rows.start - block : rows.stop - block]
-            parts.append(_deviation(model, evidence, position[rows], normal[rows], sightings))
+            parts.append(_deviation(model, residuals, position[rows], normal[rows], sightings))
             on_progress(rows.stop / len(position))
     return _smoothed(Deviation.joined(parts), position, normal)
 
 
 def deviations_at(run: Run, points: OrientedPoints) -> Float[Tensor, "N 3"]:
-    """Gather evidence and compute `material_deviation`; the columns are base colour, roughness, metallic."""
-    deviation = material_deviation(run.model, gather_evidence(run), points.position, points.normal)
+    """`material_deviation` at points of a run; the columns are base colour, roughness, metallic."""
+    deviation = material_deviation(run.model, measure_residuals(run), points.position, points.normal)
     return torch.cat([deviation.base_color, deviation.roughness, deviation.metallic], dim=-1)
 
 
-def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int = 1) -> RenderedView:
+def with_deviation(run: Run, residuals: TrainingResiduals, view: RenderedView, step: int = 1) -> RenderedView:
     """Add the maps base_color_std, roughness_std and metallic_std to a rendered view; 0 off the surface.
 
     With a `step` of k only every k-th pixel of every k-th row is computed, and each result fills a block of
@@ -184,7 +184,7 @@ def with_deviation(run: Run, evidence: Evidence, view: RenderedView, step: int =
     computed = np.zeros((height, width), bool)
     computed[::step, ::step] = view.maps["opacity"][::step, ::step, 0] > 0.5
     points = surface_at_pixels(run, view, np.flatnonzero(computed))
-    deviation = material_deviation(run.model, evidence, points.position, points.normal)
+    deviation = material_deviation(run.model, residuals, points.position, points.normal)
     maps = dict(view.maps)
     for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):
         values = np.zeros((height, width, 1), np.float32)
@@ -231,7 +231,7 @@ def _smoothed(
 
 def _deviation(
     model: NeilfModel,
-    evidence: Evidence,
+    residuals: TrainingResiduals,
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
     sightings: Sightings,
@@ -241,28 +241,28 @@ def _deviation(
     incident = light_by_patch(model, position, normal, sightings.wo, material)
     sent = sent_by_patch(model, incident, material, normal, sightings.wo)
     deviations = _light_deviations(model).to(sent)
-    atypical = sent - sent.sum(-1, keepdim=True) * evidence.typical
+    atypical = sent - sent.sum(-1, keepdim=True) * residuals.typical
     outside = torch.cat((atypical[..., :PATCHES], atypical[..., 2 * PATCHES :]), -1).sum(-1, keepdim=True)
     observations = Observations(
         visible=sightings.visible,
         radiance=_to_radiance(model, sightings.pixel),
-        noise=evidence.noise * _unit_error(model, sightings.pixel),
+        noise=residuals.noise * _unit_error(model, sightings.pixel),
         shared=torch.cat((atypical * deviations[:-1], outside * deviations[-1]), -1),
     )
     parts = radiance_parts(model, incident, normal, sightings.wo)
     deviation = expected_error(parts, observations, material, model.config.shading.specular)
-    return _widened(deviation, prior_error(material), _birge_ratio(model, evidence, sent.sum(-1), sightings))
+    return _widened(deviation, prior_error(material), _birge_ratio(model, residuals, sent.sum(-1), sightings))
 
 
 def _birge_ratio(
-    model: NeilfModel, evidence: Evidence, sent: Float[Tensor, "N V 3"], sightings: Sightings
+    model: NeilfModel, residuals: TrainingResiduals, sent: Float[Tensor, "N V 3"], sightings: Sightings
 ) -> Float[Tensor, "N 1"]:
     """Ratio of a point's root mean square residual to that of a typical point; 1 if no view sees the point.
 
     Expected errors are multiplied by it, as measurements that disagree more than their errors allow are in
     the method of Birge (Physical Review 40, 1932).
     """
-    error = (_relative_error(model, sent, sightings) / evidence.misfit).square()
+    error = (_relative_error(model, sent, sightings) / residuals.misfit).square()
     views = sightings.visible.sum(1)
     mean = (PRIOR_VIEWS + views * _mean_over_views(error, sightings)) / (PRIOR_VIEWS + views)
     return mean.sqrt()[:, None]

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-__all__ = ["Entry", "explain"]
+__all__ = ["FigureStyle", "style_of"]
 
 
 @dataclass(frozen=True)
-class Entry:
+class FigureStyle:
     """How a figure is displayed.
 
     Attributes:
@@ -30,38 +30,38 @@ class Entry:
         return self.pattern % value
 
 
-def _decibels(title: str, meaning: str) -> Entry:
-    return Entry(title, "%.2f dB", "higher", meaning)
+def _decibels(title: str, meaning: str) -> FigureStyle:
+    return FigureStyle(title, "%.2f dB", "higher", meaning)
 
 
-def _length(title: str, meaning: str) -> Entry:
-    return Entry(title, "%.4f", "lower", meaning)
+def _length(title: str, meaning: str) -> FigureStyle:
+    return FigureStyle(title, "%.4f", "lower", meaning)
 
 
-def _millimeters(title: str, meaning: str) -> Entry:
-    return Entry(title, "%.3f mm", "lower", meaning)
+def _millimeters(title: str, meaning: str) -> FigureStyle:
+    return FigureStyle(title, "%.3f mm", "lower", meaning)
 
 
-def _similarity(title: str) -> Entry:
-    return Entry(title, "%.4f", "higher", "Structural similarity (SSIM); 1 means identical.")
+def _similarity(title: str) -> FigureStyle:
+    return FigureStyle(title, "%.4f", "higher", "Structural similarity (SSIM); 1 means identical.")
 
 
-def _log(title: str, meaning: str) -> Entry:
-    return Entry(title, "%.3f", "lower", meaning)
+def _log(title: str, meaning: str) -> FigureStyle:
+    return FigureStyle(title, "%.3f", "lower", meaning)
 
 
-def _ratio(title: str) -> Entry:
+def _ratio(title: str) -> FigureStyle:
     meaning = (
         "Error of the half of the pixels with the smaller expected error, over that of the other half; "
         "1 means no better than chance."
     )
-    return Entry(title, "%.2f", "lower", meaning)
+    return FigureStyle(title, "%.2f", "lower", meaning)
 
 
 SCALED_IMAGES = "After the median factor per view and channel, because the exposure of a new view is unknown."
 SCALED_LIGHT = "The same after the best factor per channel."
 
-ENTRIES: Mapping[str, Entry] = {
+STYLES: Mapping[str, FigureStyle] = {
     "volume_psnr": _decibels(
         "Image, volume rendering", "Test views rendered from the outgoing radiance field, tone-mapped."
     ),
@@ -89,7 +89,9 @@ ENTRIES: Mapping[str, Entry] = {
     ),
     "roughness_psnr": _decibels("Roughness", "As estimated; 0 is a mirror, 1 is matte."),
     "metallic_psnr": _decibels("Metallic", "As estimated; 0 is a non-metal, 1 is a metal."),
-    "normal_mae_deg": Entry("Normals", "%.2f°", "lower", "Mean angle between estimated and true normals."),
+    "normal_mae_deg": FigureStyle(
+        "Normals", "%.2f°", "lower", "Mean angle between estimated and true normals."
+    ),
     "chamfer": _length(
         "Surface", "Mean distance between the surfaces, scene units (the object has radius 1)."
     ),
@@ -117,15 +119,15 @@ ENTRIES: Mapping[str, Entry] = {
     "albedo_ssim": _similarity("Structure of the albedo, scaled"),
     "albedo_single_psnr": _decibels("Albedo, one factor", "After one factor for all channels."),
     "albedo_single_ssim": _similarity("Structure of the albedo, one factor"),
-    "roughness_mse": Entry("Roughness", "%.4f", "lower", "Mean squared error over the frame."),
-    "normal_distance": Entry("Normals, 1 − cosine", "%.4f", "lower", "Mean over the eroded mask."),
-    "depth_mse": Entry(
+    "roughness_mse": FigureStyle("Roughness", "%.4f", "lower", "Mean squared error over the frame."),
+    "normal_distance": FigureStyle("Normals, 1 − cosine", "%.4f", "lower", "Mean over the eroded mask."),
+    "depth_mse": FigureStyle(
         "Depth, scaled", "%.4g", "lower", "Mean squared error after one factor for all views."
     ),
     "chamfer_mm": _millimeters("Surface", "Mean of the two below."),
     "chamfer_accuracy_mm": _millimeters("Surface, accuracy", "From the estimate to the truth."),
     "chamfer_completeness_mm": _millimeters("Surface, completeness", "From the truth to the estimate."),
-    "base_color_gamma": Entry(
+    "base_color_gamma": FigureStyle(
         "Gamma of base colour",
         "%.3f",
         "neither",
@@ -137,24 +139,24 @@ ENTRIES: Mapping[str, Entry] = {
 }
 
 
-def explain(name: str) -> Entry:
+def style_of(name: str) -> FigureStyle:
     """Look up how a figure is displayed.
 
     A `baseline_` figure and a `_frame` figure get the entry of their base figure with a changed title. An
     unknown figure gets its own name as title.
     """
-    if name in ENTRIES:
-        return ENTRIES[name]
-    base = ENTRIES.get(name.removeprefix("baseline_"))
+    if name in STYLES:
+        return STYLES[name]
+    base = STYLES.get(name.removeprefix("baseline_"))
     if base is not None:
         return replace(
             base,
             title=f"{base.title}, naive baseline",
             meaning="Without a method: a constant, or the mean observed colour.",
         )
-    masked = ENTRIES.get(name.removesuffix("_frame"))
+    masked = STYLES.get(name.removesuffix("_frame"))
     if masked is not None:
         return replace(
             masked, title=f"{masked.title}, whole frame", meaning="The background counts as free of error."
         )
-    return Entry(name.replace("_", " ").capitalize(), "%.4g", "higher", "")
+    return FigureStyle(name.replace("_", " ").capitalize(), "%.4g", "higher", "")

@@ -13,7 +13,7 @@ from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.evaluate.pictures import (
     Group,
-    Row,
+    PictureRow,
     Section,
     auto_exposure,
     cut_out,
@@ -92,7 +92,7 @@ def light_sections(
             for title, column in zip(titles, columns, strict=True):
                 picture = cut_out(display_color(column[i], exposure), above[i], SHADE)
                 pictures.append(picture if title == "truth" else ring(picture, _lamps_above(run, point)))
-        sections.append(Section(tuple(groups), (Row("Incident light", tuple(pictures), note),)))
+        sections.append(Section(tuple(groups), (PictureRow("Incident light", tuple(pictures), note),)))
     return sections
 
 

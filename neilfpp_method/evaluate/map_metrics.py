@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.evaluate import metrics
-from neilfpp_method.evaluate.confidence import gather_evidence, material_deviation, surface_at_pixels
+from neilfpp_method.evaluate.confidence import material_deviation, measure_residuals, surface_at_pixels
 from neilfpp_method.evaluate.views import KnownView, RenderedView, mean_observed_color, surface_points
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear, tone_map
 from neilfpp_method.structures import OrientedPoints
@@ -132,7 +132,7 @@ def confidence_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     points = OrientedPoints.joined(
         [surface_at_pixels(run, view, r) for (view, _), r in zip(pairs, rows, strict=True)]
     )
-    deviation = material_deviation(run.model, gather_evidence(run), points.position, points.normal)
+    deviation = material_deviation(run.model, measure_residuals(run), points.position, points.normal)
 
     figures = {}
     for name in ("base_color", "roughness", "metallic") if run.config.shading.specular else ("base_color",):

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from neilfpp_method.evaluate.metrics import align_scale
 from neilfpp_method.evaluate.pictures import (
     Group,
-    Row,
+    PictureRow,
     Section,
     auto_exposure,
     cut_out,
@@ -24,7 +24,7 @@ from neilfpp_method.evaluate.views import KnownView, RenderedView
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.train.run import Run
 
-__all__ = ["ComparedMap", "Comparison", "albedo_scale", "compared_maps", "view_sections"]
+__all__ = ["ComparedMap", "MapComparison", "albedo_scale", "compared_maps", "view_sections"]
 
 LARGEST_IMAGE_ERROR = 0.25
 """Error at the bright end of the colour scale for images, in display values."""
@@ -35,7 +35,7 @@ LARGEST_ANGLE = 45.0
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MapComparison:
     """One map of one view as 8-bit images.
 
     Attributes:
@@ -69,7 +69,7 @@ class ComparedMap:
     name: str
     title: str
     note: str
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[MapComparison, ...]
     largest: float
     unit: str = ""
 
@@ -79,15 +79,15 @@ class ComparedMap:
         return any(c.truth is not None for c in self.comparisons)
 
     @property
-    def row(self) -> Row:
+    def row(self) -> PictureRow:
         """A row with truth, estimate and error of each view."""
         cells = tuple(cell for c in self.comparisons for cell in (c.truth, c.estimate, c.error))
-        return Row(self.title, cells, self.note, f"{self.largest:g}{self.unit}")
+        return PictureRow(self.title, cells, self.note, f"{self.largest:g}{self.unit}")
 
     @property
-    def estimates(self) -> Row:
+    def estimates(self) -> PictureRow:
         """A row with the estimate of each view."""
-        return Row(self.title, tuple(c.estimate for c in self.comparisons), self.note)
+        return PictureRow(self.title, tuple(c.estimate for c in self.comparisons), self.note)
 
 
 def view_sections(
@@ -147,7 +147,7 @@ def _image_map(
     for view, image in zip(rendered, images, strict=True):
         estimate, truth = display_color(view.maps[name], exposure), display_color(image, exposure)
         error = display_error(_difference(estimate, truth), LARGEST_IMAGE_ERROR)
-        comparisons.append(Comparison(estimate, truth, error))
+        comparisons.append(MapComparison(estimate, truth, error))
     source = "rendering equation" if name == "rgb" else "volume rendering"
     note = f"{source}\nexposure {exposure:.2g}" if run.capture.hdr else source
     return ComparedMap(name, "Image", note, tuple(comparisons), LARGEST_IMAGE_ERROR)
@@ -184,7 +184,7 @@ def _material_map(
     for view, k in zip(rendered, known, strict=True):
         estimate = display(name, view.maps[name] * factor)
         hit = view.maps["base_color"].any(-1)
-        comparison = Comparison(cut_out(estimate, hit), hit=hit)
+        comparison = MapComparison(cut_out(estimate, hit), hit=hit)
         if k.material is not None:
             truth = display(name, k.material[name])
             error = display_error(_difference(estimate, truth), LARGEST_MATERIAL_ERROR)
@@ -208,10 +208,10 @@ def _deviation_maps(rendered: Sequence[RenderedView]) -> Iterator[ComparedMap]:
             yield ComparedMap(name, f"{title} ±", note, comparisons, LARGEST_MATERIAL_ERROR)
 
 
-def _deviation(view: RenderedView, name: str) -> Comparison:
+def _deviation(view: RenderedView, name: str) -> MapComparison:
     picture = display_error(view.maps[name][..., 0], LARGEST_MATERIAL_ERROR)
     hit = view.surface_mask
-    return Comparison(cut_out(picture, hit), hit=hit)
+    return MapComparison(cut_out(picture, hit), hit=hit)
 
 
 def _normal_map(rendered: Sequence[RenderedView], known: Sequence[KnownView]) -> ComparedMap:
@@ -219,7 +219,7 @@ def _normal_map(rendered: Sequence[RenderedView], known: Sequence[KnownView]) ->
     for view, k in zip(rendered, known, strict=True):
         normal = view.maps["normal"]
         hit = view.surface_mask
-        comparison = Comparison(cut_out(display("normal", normal), hit), hit=hit)
+        comparison = MapComparison(cut_out(display("normal", normal), hit), hit=hit)
         if k.normal is not None:
             angle = np.degrees(np.arccos(np.clip((normal * k.normal).sum(-1), -1.0, 1.0)))
             error = cut_out(display_error(angle, LARGEST_ANGLE), k.mask)

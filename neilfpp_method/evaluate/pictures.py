@@ -19,7 +19,7 @@ from neilfpp_method.shading.color import luminance, tone_map
 
 __all__ = [
     "Group",
-    "Row",
+    "PictureRow",
     "Section",
     "auto_exposure",
     "contact_sheet",
@@ -152,7 +152,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Row:
+class PictureRow:
     """One row of a section.
 
     Attributes:
@@ -173,7 +173,7 @@ class Section:
     """Rows that have the same columns."""
 
     groups: tuple[Group, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[PictureRow, ...]
 
 
 # Lengths of the layout, pixels.
@@ -253,7 +253,7 @@ def _section_height(section: Section) -> int:
     return HEADER_HEIGHT + sum(_row_height(row) + GAP for row in section.rows) + GROUP_GAP
 
 
-def _row_height(row: Row) -> int:
+def _row_height(row: PictureRow) -> int:
     return max([MIN_ROW_HEIGHT] + [picture.shape[0] for picture in row.pictures if picture is not None])
 
 

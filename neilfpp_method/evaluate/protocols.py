@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.map_metrics import (
@@ -40,7 +41,6 @@ from neilfpp_method.evaluate.views import RenderedView, known_test_views, mask_s
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.train.health_record import read_findings
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.run import Run
 
 __all__ = ["evaluate", "protocol", "write_metrics"]

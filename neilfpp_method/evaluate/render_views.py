@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
+from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.views import RenderedView, render_view
 from neilfpp_method.train.run import Run
@@ -27,7 +26,7 @@ RENDERING = 0.95
 def render_run(
     run: Run,
     out: Path,
-    views: str | Collection[str] = "test",
+    views: Sequence[str] = ("test",),
     overwrite: bool = False,
     confidence: bool = False,
     on_progress: Callable[[float], None] = lambda share: None,
@@ -41,7 +40,7 @@ def render_run(
     Args:
         run: the trained run.
         out: the folder to write.
-        views: "test", "train", "all", or names of views.
+        views: names of views, or of groups of views: "test", "train", "all".
         overwrite: also render views whose EXR exists.
         confidence: also write the expected errors of base colour, roughness and metallic
             (`confidence.with_deviation`).
@@ -53,10 +52,10 @@ def render_run(
     Raises:
         UserError: the capture has no such view, or `confidence` is set and the run has no material yet.
     """
-    names = view_names(run.capture, views)
+    names = {view.name for view in run.capture.chosen_views(views)}
     if confidence and not run.has_material:
         raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
-    evidence = gather_evidence(run) if confidence else None
+    residuals = measure_residuals(run) if confidence else None
     written = []
     for i, view in enumerate(run.capture.views):
         if view.name not in names:
@@ -70,31 +69,9 @@ def render_run(
             rendered = render_view(
                 run, i, lambda share, done=done: on_progress((done + RENDERING * share) / len(names))
             )
-            _write(rendered if evidence is None else with_deviation(run, evidence, rendered), out)
+            _write(rendered if residuals is None else with_deviation(run, residuals, rendered), out)
         on_progress(len(written) / len(names))
     return written
-
-
-def view_names(capture: Capture, views: str | Collection[str]) -> frozenset[str]:
-    """Resolve "test", "train", "all" or names of views to a set of names.
-
-    Raises:
-        UserError: the capture has no such view, or the group is empty.
-    """
-    existing = frozenset(view.name for view in capture.views)
-    groups = {"all": existing, "test": capture.test, "train": existing - capture.test}
-    if isinstance(views, str) and views in groups:
-        if not groups[views]:
-            raise UserError(
-                f"{capture.root}: there is no {views} view", "give --views all, or names of views"
-            )
-        return groups[views]
-    names = frozenset([views] if isinstance(views, str) else views)
-    if missing := sorted(names - existing):
-        raise UserError(
-            f"{capture.root}: there is no view '{missing[0]}'", "give test, train, all, or names of views"
-        )
-    return names
 
 
 def _write(view: RenderedView, out: Path) -> None:

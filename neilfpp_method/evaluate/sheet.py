@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.images import write_png
-from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
+from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.panels import albedo_scale, view_sections
 from neilfpp_method.evaluate.pictures import contact_sheet
@@ -42,8 +42,8 @@ def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] =
     known = known_test_views(displayed, rendered).views
     scale = albedo_scale(rendered, known) if run.has_material else None
     if run.has_material and run.capture.train_views:
-        evidence = gather_evidence(run)
-        rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
+        residuals = measure_residuals(run)
+        rendered = [with_deviation(run, residuals, view, CONFIDENCE_STEP) for view in rendered]
     views = view_sections(displayed, rendered, known, scale)
     light = light_sections(displayed, rendered, scale) if run.has_material else []
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"

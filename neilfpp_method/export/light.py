@@ -18,10 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.probes import probe, spread_over_surface
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.run import Run
 
 __all__ = ["ExportedLight", "check_light", "export_light", "lamps_in_world"]

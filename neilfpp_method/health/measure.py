@@ -44,12 +44,9 @@ def measure_surface(model: NeilfModel, pixels: PixelBatch, with_material: bool) 
         pixels: training pixels on the device of the model; those off the object are ignored.
         with_material: whether there is a material to measure.
     """
-    mode = model.training
-    model.eval()
-    hits = model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays)
-    result = measure_hits(model, hits, with_material)
-    model.train(mode)
-    return result
+    with model.evaluating():
+        hits = model.host.render(pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]].rays)
+        return measure_hits(model, hits, with_material)
 
 
 @torch.no_grad()

@@ -73,7 +73,7 @@ class MeshHost(nn.Module):
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
-        self.offset = config.inter_reflection.offset
+        self.offset = config.ray_offset
         self.normal_radius = config.volume.normal_radius
         self._tracers: dict[torch.device, FirstHits] = {}
 

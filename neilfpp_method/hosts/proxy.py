@@ -24,7 +24,7 @@ from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.distance_grid import GridHits, look_up, trace_grid
-from neilfpp_method.volume.fusion import FusedSurface, fuse, grid_normal, mean_at
+from neilfpp_method.volume.fusion import FusedSurface, fuse_surface, grid_normal, mean_at
 
 __all__ = ["ProxyReport", "SurfaceProxy"]
 
@@ -201,7 +201,7 @@ class SurfaceProxy(nn.Module):
     def _fused(self) -> FusedSurface:
         rows = self.points.kept()
         rows = rows[rows[:, 3:6].square().sum(-1) > 0]
-        return fuse(rows[:, :3], rows[:, 3:6], rows[:, 6:9], self.radius, self.resolution)
+        return fuse_surface(rows[:, :3], rows[:, 3:6], rows[:, 6:9], self.radius, self.resolution)
 
     def _compare(self, observed: ObservedRays, traced: GridHits) -> ProxyReport:
         """Compare new rays of the host with those through the grid."""

@@ -336,7 +336,7 @@ class VolSdfHost(nn.Module):
 
     # ------------------------------------------------------------------------------------------- regularisers
 
-    @timed("regularisers")
+    @timed("regularizers")
     def _regularizers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
         inputs = self._regularizer_inputs(march) if {"eikonal", "surface", "hessian"} & set(names) else None

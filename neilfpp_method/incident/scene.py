@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host, TracesLight
-from neilfpp_method.settings.types import InterReflectionConfig
 from neilfpp_method.structures import RayBatch, SceneLight, SceneTracer
 from neilfpp_method.timing.ledger import timed
 
@@ -26,9 +25,9 @@ RAYS_AT_ONCE = 2048
 """Number of rays per batch for a host without cheap tracing; limits memory."""
 
 
-def scene_tracer(host: Host, config: InterReflectionConfig, hit_share: float) -> SceneTracer:
+def scene_tracer(host: Host, offset: float, hit_share: float) -> SceneTracer:
     """`scene_light` of a host, as a function of surface points and directions."""
-    return lambda x, wi: scene_light(host, x, wi, config, hit_share)
+    return lambda x, wi: scene_light(host, x, wi, offset, hit_share)
 
 
 @timed("tracing")
@@ -37,7 +36,7 @@ def scene_light(
     host: Host,
     x: Float[Tensor, "N 3"],
     wi: Float[Tensor, "N S 3"],
-    config: InterReflectionConfig,
+    offset: float,
     hit_share: float,
 ) -> SceneLight:
     """Light from the scene's surfaces at surface points, without gradient.
@@ -48,13 +47,13 @@ def scene_light(
         host: geometry and outgoing radiance.
         x: surface points, scene frame.
         wi: unit directions away from the surface.
-        config: `offset` is the distance from x at which rendered rays start, scene units.
+        offset: distance from x at which rendered rays start, scene units.
         hit_share: smallest concentration of the rendering weight that counts as a hit.
     """
     x = x.detach()
     if isinstance(host, TracesLight):
         return host.scene_light(x, wi)
-    start = (x[:, None] + config.offset * wi).reshape(-1, 3)
+    start = (x[:, None] + offset * wi).reshape(-1, 3)
     radiance, distance = [], []
     for origins, directions in zip(
         start.split(RAYS_AT_ONCE), wi.reshape(-1, 3).split(RAYS_AT_ONCE), strict=True

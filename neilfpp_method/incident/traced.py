@@ -12,7 +12,7 @@ from torch import Tensor
 from neilfpp_method.hosts.base import Host, PredictsMisses
 from neilfpp_method.incident.scene import off_surface
 from neilfpp_method.losses import scale_gradient
-from neilfpp_method.settings.types import InterReflectionConfig
+from neilfpp_method.settings.types import MeshConfig, NeilfConfig
 from neilfpp_method.shading.frame import local_frame
 from neilfpp_method.structures import RayBatch
 
@@ -21,6 +21,10 @@ __all__ = ["TracedLight", "trace_light"]
 MAX_ANGLE_DEG = 80.0
 """Largest angle of a ray from the normal, degrees. At larger angles a ray stays in the soft layer of its own
 surface, and contributes little light.
+"""
+RADIANCE_GRADIENT = 0.7
+"""Scale of the gradient of L_ref into R of a mesh, which is accurate because the geometry is given (published
+code). R of recovered geometry gets no gradient: it must reproduce the images.
 """
 MAX_START = 0.2
 """Largest distance of the start of a ray from its surface point, scene units (published code). A ray that has
@@ -46,37 +50,36 @@ def trace_light(
     host: Host,
     position: Float[Tensor, "N 3"],
     normal: Float[Tensor, "N 3"],
-    config: InterReflectionConfig,
-    hit_share: float,
+    config: NeilfConfig,
 ) -> TracedLight:
     """Trace random directions from random points through the host.
 
     Directions are uniform in solid angle within `MAX_ANGLE_DEG` of the normal. A ray starts at a height of
-    `config.offset` plus four widths of the host's surface, so its displacement along the ray grows as 1/cos
-    θ. Rays that would start further than `MAX_START` from their point are left out. No gradient flows into
-    the positions: L_ref must not move the surface.
+    `config.ray_offset` plus four widths of the host's surface above its point, so its displacement along the
+    ray grows as 1/cos θ. Rays that would start further than `MAX_START` from their point are left out. No
+    gradient flows into the positions: L_ref must not move the surface.
 
     Args:
-        host: renders the rays. The gradient into its radiance is scaled by `config.radiance_gradient`.
+        host: renders the rays.
         position: surface points, scene frame.
         normal: outward unit normals.
-        config: rays per point, offset, and gradient scale.
-        hit_share: smallest concentration of the rendering weight that counts as a hit.
+        config: the settings; rays per point, their start, and what counts as a hit.
     """
     position, normal = position.detach(), normal.detach()
-    chosen = _random_rows(position.shape[0], config.rays_per_point, position.device)
+    chosen = _random_rows(position.shape[0], config.inter_reflection.rays_per_point, position.device)
     position, normal = position[chosen], normal[chosen]
     wi = _cone_directions(normal, math.cos(math.radians(MAX_ANGLE_DEG)))
-    start = off_surface(host, position, normal, wi, config.offset)
+    start = off_surface(host, position, normal, wi, config.ray_offset)
     is_traced = (start - position).norm(dim=-1) <= MAX_START
     if isinstance(host, PredictsMisses):
         is_traced &= host.may_hit(RayBatch(start, wi))
     rows = torch.nonzero(is_traced)[:, 0]
     position, start, wi = position[rows], start[rows], wi[rows]
-    with torch.set_grad_enabled(torch.is_grad_enabled() and config.radiance_gradient > 0.0):
+    trains_radiance = isinstance(config.host, MeshConfig)
+    with torch.set_grad_enabled(torch.is_grad_enabled() and trains_radiance):
         hits = host.render(RayBatch(start, wi))
-    radiance = scale_gradient(hits.color, config.radiance_gradient)
-    return TracedLight(position, wi, radiance, hits.is_hit(hit_share))
+    radiance = scale_gradient(hits.color, RADIANCE_GRADIENT if trains_radiance else 0.0)
+    return TracedLight(position, wi, radiance, hits.is_hit(config.shading.hit_share))
 
 
 def _random_rows(points: int, per_point: float, device: torch.device) -> Tensor:

@@ -173,69 +173,80 @@ def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
 
 
 def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Finding]:
-    if damaged := [view for view in views if view.unreadable]:
-        names = tuple(view.name for view in damaged)
-        yield Finding(
-            "unreadable",
-            "problem",
-            damaged[0].unreadable,
-            "export these images again, or leave them out",
-            names,
-        )
-    if broken := tuple(view.name for view in views if view.broken > 0):
-        most = max(view.broken for view in views)
-        text = f"pixels are NaN, infinite or negative, up to {100 * most:.2g} % of a view"
-        yield Finding(
-            "broken_pixels", "problem", text, "repair them, or mark them in a validity mask", broken
-        )
-    if black := tuple(view.name for view in views if not view.unreadable and view.luminance <= 0):
-        yield Finding(
-            "black",
-            "problem",
-            "all pixels of the object are black, or the whole picture has one colour",
-            "leave these views out, or correct the masks",
-            black,
-        )
-    jumps = [
-        (view.name, factor)
-        for view, factor in zip(views, factors, strict=True)
-        if max(factor, 1 / factor) > JUMP
-    ]
-    if jumps:
-        named = ", ".join(f"{name} ×{factor:.2g}" for name, factor in jumps[:4]) + (
-            "…" if len(jumps) > 4 else ""
-        )
-        own, alike = (
-            "give these views their exposure in capture.json",
-            "expose all images alike, or merge brackets",
-        )
-        text = f"brighter or darker than the views around them: {named}"
-        yield Finding(
-            "exposure_jump", "problem", text, own if capture.hdr else alike, tuple(name for name, _ in jumps)
-        )
-    sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
-    if blurred := tuple(view.name for view in views if 0 < view.sharpness < BLURRED * sharp):
-        text = f"blurred: less than {100 * BLURRED:.0f} % of the usual fine detail"
-        yield Finding("blurred", "warning", text, "leave these views out, or take them again", blurred)
+    yield from _of_files(views)
+    yield from _of_exposures(views, factors, capture)
     readable = [view for view in views if not view.unreadable]
-    if pairs := duplicates([view.small for view in readable]) if readable else ():
-        names = ", ".join(f"{readable[i].name} and {readable[j].name}" for i, j in pairs[:3]) + (
-            "…" if len(pairs) > 3 else ""
-        )
-        again = tuple(dict.fromkeys(readable[j].name for _, j in pairs))
-        yield Finding("duplicate", "warning", f"the same picture twice: {names}", "keep one of each", again)
+    yield from _of_pictures(readable)
+    yield from _of_values(readable, capture)
+
+
+def _of_files(views: Sequence[ViewFigures]) -> Iterator[Finding]:
+    """Findings on files that hold no usable image."""
+    if damaged := [view for view in views if view.unreadable]:
+        text, remedy = damaged[0].unreadable, "export these images again, or leave them out"
+        yield Finding("unreadable", "problem", text, remedy, _names(damaged))
+    if broken := [view for view in views if view.broken > 0]:
+        most = max(view.broken for view in broken)
+        text = f"pixels are NaN, infinite or negative, up to {100 * most:.2g} % of a view"
+        remedy = "repair them, or mark them in a validity mask"
+        yield Finding("broken_pixels", "problem", text, remedy, _names(broken))
+    if black := [view for view in views if not view.unreadable and view.luminance <= 0]:
+        text = "all pixels of the object are black, or the whole picture has one colour"
+        remedy = "leave these views out, or correct the masks"
+        yield Finding("black", "problem", text, remedy, _names(black))
+
+
+def _of_exposures(
+    views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture
+) -> Iterator[Finding]:
+    """Findings on views that are brighter or darker than the views around them."""
+    pairs = zip(views, factors, strict=True)
+    jumps = {view.name: factor for view, factor in pairs if max(factor, 1 / factor) > JUMP}
+    if jumps:
+        named = _listed([f"{name} ×{factor:.2g}" for name, factor in jumps.items()], most=4)
+        text = f"brighter or darker than the views around them: {named}"
+        own = "give these views their exposure in capture.json"
+        alike = "expose all images alike, or merge brackets"
+        yield Finding("exposure_jump", "problem", text, own if capture.hdr else alike, tuple(jumps))
+
+
+def _of_pictures(views: Sequence[ViewFigures]) -> Iterator[Finding]:
+    """Findings on pictures that add nothing: blurred ones and duplicates."""
+    sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
+    if blurred := [view for view in views if 0 < view.sharpness < BLURRED * sharp]:
+        text = f"blurred: less than {100 * BLURRED:.0f} % of the usual fine detail"
+        remedy = "leave these views out, or take them again"
+        yield Finding("blurred", "warning", text, remedy, _names(blurred))
+    if pairs := duplicates([view.small for view in views]) if views else ():
+        named = _listed([f"{views[i].name} and {views[j].name}" for i, j in pairs], most=3)
+        again = tuple(dict.fromkeys(views[j].name for _, j in pairs))
+        yield Finding("duplicate", "warning", f"the same picture twice: {named}", "keep one of each", again)
+
+
+def _of_values(views: Sequence[ViewFigures], capture: Capture) -> Iterator[Finding]:
+    """Findings on pixel values that carry too little information."""
     if clipped := [view for view in views if view.clipped > CLIPPED_VIEW]:
         worst = max(clipped, key=lambda view: view.clipped)
         text = f"highlights are clipped, up to {100 * worst.clipped:.2g} % of the object ({worst.name})"
         remedy = "use shorter exposures, or merge brackets; mark clipped pixels in a validity mask"
-        yield Finding("clipped", "warning", text, remedy, tuple(view.name for view in clipped))
-    if invalid := tuple(view.name for view in views if view.invalid > INVALID_VIEW):
+        yield Finding("clipped", "warning", text, remedy, _names(clipped))
+    if invalid := [view for view in views if view.invalid > INVALID_VIEW]:
         text = "more than half of the pixels are marked as invalid"
-        yield Finding("mostly_invalid", "warning", text, "check the validity masks: white is valid", invalid)
-    large = [view.levels for view in readable if view.pixels > PIXELS_PER_LEVEL * DISPLAY_LEVELS]
+        remedy = "check the validity masks: white is valid"
+        yield Finding("mostly_invalid", "warning", text, remedy, _names(invalid))
+    large = [view.levels for view in views if view.pixels > PIXELS_PER_LEVEL * DISPLAY_LEVELS]
     if capture.hdr and large and max(large) <= DISPLAY_LEVELS:
         text = f"linear files with {max(large)} levels per channel: they were converted from 8-bit images"
         yield Finding("few_levels", "problem", text, "develop the RAW files linearly, or merge brackets")
+
+
+def _names(views: Sequence[ViewFigures]) -> tuple[str, ...]:
+    return tuple(view.name for view in views)
+
+
+def _listed(parts: Sequence[str], most: int) -> str:
+    """The first parts, separated by commas, with an ellipsis if there are more."""
+    return ", ".join(parts[:most]) + ("…" if len(parts) > most else "")
 
 
 def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Finding]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from neilfpp_method.fields.lamps import LampPlaces, Lamps
 from neilfpp_method.shading.frame import safe_normalize
 
-__all__ = ["FoundLamps", "merge", "propose"]
+__all__ = ["FoundLamps", "merge_lamps", "propose"]
 
 REACH = 1.25
 """Largest distance of a candidate from the scene's centre, in scene units. The object lies in the unit
@@ -78,7 +78,7 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
 
 
 @torch.no_grad()
-def merge(
+def merge_lamps(
     places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int
 ) -> FoundLamps:
     """Merge neighbouring lamps and drop weak ones.

@@ -19,7 +19,15 @@ from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 
-__all__ = ["MIN_POINTS", "CarriedLight", "Evidence", "MapAndLamps", "compare", "evidence", "fit_light"]
+__all__ = [
+    "MIN_POINTS",
+    "CarriedLight",
+    "Evidence",
+    "MapAndLamps",
+    "error_reduction",
+    "evidence",
+    "fit_light",
+]
 
 RATE = 0.1
 """Learning rate of log radiance in the first step of a fit."""
@@ -183,7 +191,7 @@ class CarriedLight:
 
 
 @torch.no_grad()
-def compare(
+def error_reduction(
     first: CarriedLight, second: CarriedLight, target: Target, objective: Objective
 ) -> Float[Tensor, " N"]:
     """Relative error under the first light minus that under the second, at held-back points.

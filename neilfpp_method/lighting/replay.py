@@ -12,7 +12,7 @@ from torch import nn
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.structures import SurfacePixels
 
-__all__ = ["Replay"]
+__all__ = ["PointReplay"]
 
 KEPT_STEPS = 16
 """Capacity of the buffer, in steps of rays."""
@@ -20,7 +20,7 @@ WIDTHS = (3, 3, 3, 3, 1)
 """Numbers per row: position, normal, `wo`, pixel, and image gradient."""
 
 
-class Replay(nn.Module):
+class PointReplay(nn.Module):
     """The newest surface points of a stage with fixed geometry. Its state is part of a checkpoint.
 
     Args:

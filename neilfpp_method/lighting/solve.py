@@ -9,9 +9,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.fields.environment import EVEN_ROWS, EnvironmentLight
+from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.candidates import merge, propose
-from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, compare, evidence
+from neilfpp_method.lighting.candidates import FoundLamps, merge_lamps, propose
+from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, error_reduction, evidence
 from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
@@ -86,18 +87,26 @@ def solve_light(
     else:
         found = start.fit(target, objective)
     unknown.copy_(found.log_radiance)
-    merged = merge(places, found.intensity, from_candidates.sources[0].mean(0), len(lamps.position))
-    map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
-    merged = settle_lamps(merged, lamps.radius, map_light, points, objective)
-    # The map was fitted together with the candidates, so it must be fitted again with the refined lamps.
-    from_merged = points.from_lamps(merged.places, lamps.radius)
-    refined = CarriedLight(
-        MapAndLamps(unknown, merged.intensity), map_only.transport.concatenate(from_merged)
-    )
-    found = refined.fit(target, objective)
-    unknown.copy_(found.log_radiance)
-    lamps.place(merged.places.position, found.intensity, merged.places.axis)
+    reach = from_candidates.sources[0].mean(0)
+    merged = merge_lamps(places, found.intensity, reach, most=len(lamps.position))
+    _settle(lamps, merged, map_only, points, objective)
     return measured
+
+
+def _settle(
+    lamps: Lamps, merged: FoundLamps, map_only: CarriedLight, points: FitPoints, objective: Objective
+) -> None:
+    """Move merged lamps to where they explain the points best, fit map and lamps again, and set both.
+
+    The map was fitted together with the candidates, so it must be fitted again with the lamps in their place.
+    """
+    unknown = map_only.light.log_radiance
+    map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
+    settled = settle_lamps(merged, lamps.radius, map_light, points, objective)
+    transport = map_only.transport.concatenate(points.from_lamps(settled.places, lamps.radius))
+    found = CarriedLight(MapAndLamps(unknown, settled.intensity), transport).fit(points.target, objective)
+    unknown.copy_(found.log_radiance)
+    lamps.place(settled.places.position, found.intensity, settled.places.axis)
 
 
 def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> CarriedLight:
@@ -144,7 +153,7 @@ def _compare_at_held_back_points(
         plain = map_only[fitted].fit(target[fitted], objective)
         found = with_lamps[fitted].fit(target[fitted], objective)
         lights = (map_only[held_back].with_light(plain), with_lamps[held_back].with_light(found))
-        gains.append(compare(*lights, target[held_back], objective))
+        gains.append(error_reduction(*lights, target[held_back], objective))
     return _Compared(plain, found, evidence(torch.cat(gains)))
 
 

@@ -30,7 +30,7 @@ __all__ = [
     "CaptureDataManager",
     "CaptureDataManagerConfig",
     "CaptureDataset",
-    "pixel_batch",
+    "to_pixel_batch",
 ]
 
 PIXELS = "neilfpp_pixels"
@@ -92,7 +92,7 @@ class CaptureDataset(InputDataset):
         return values.reshape(camera.height, camera.width, -1)
 
 
-def pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> PixelBatch:
+def to_pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> PixelBatch:
     """Convert nerfstudio's rays and batch of pixels to a `PixelBatch`; both are in the scene frame."""
     facts = {name: batch[key].to(origins.device)[:, 0] for key, name in FACTS.items()}
     color, view = batch["image"].to(origins.device), batch["indices"][:, 0].to(origins.device)

@@ -34,7 +34,7 @@ from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.plugin.datamanager import PIXELS, VALID, pixel_batch
+from neilfpp_method.plugin.datamanager import PIXELS, VALID, to_pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
@@ -46,7 +46,15 @@ from neilfpp_method.shading.sampling import combine, cosine
 from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
-from neilfpp_method.train.optimizer import adam, limit_surface_width, seed_step, set_rates, waiting_fields
+from neilfpp_method.train.optimizer import (
+    Stream,
+    adam,
+    limit_surface_width,
+    seed_step,
+    seed_stream,
+    set_rates,
+    waiting_fields,
+)
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -101,7 +109,7 @@ class NeilfMethod(Model):
         settings = self.config.neilf
         self.proxy: SurfaceProxy | None = None
         facts = scene_facts(pixels.capture, pixels, settings)
-        seed_step(settings.train.seed, step=-1)
+        seed_stream(settings.train.seed, Stream.WEIGHTS)
         self.rates = settings.optimizer
         if self.config.host is None:
             self.neilf = build_model(pixels.capture, facts, settings)
@@ -109,7 +117,7 @@ class NeilfMethod(Model):
             self._build_on(self.config.host, facts)
         self.pixels = pixels
         self.light_solver = self.neilf.light_solver()
-        seed_step(settings.train.seed, step=-2)
+        seed_stream(settings.train.seed, Stream.HEALTH)
         self.watch = Watch(pixels.sample(CHECKED_PIXELS, gradients=False), CONSOLE.log)
         self.guard = StepGuard(CONSOLE.log)
         self.record: RunRecord | None = None
@@ -214,13 +222,12 @@ class NeilfMethod(Model):
     def _start_light(self, step: int) -> None:
         """Set the initial light before material is trained, as in the standalone loop."""
         settings = self.config.neilf
-        seed_step(settings.train.seed, -4 - step)
+        seed_stream(settings.train.seed, Stream.LIGHT, step)
         plan, pixels = Plan.begin(EffectRequest("as-set"), settings), self.pixels.on(self.device)
         first = review_light(plan, self.neilf, pixels, step).first
         if first is not None:
             CONSOLE.log(first.summary())
-            start_with(self.neilf, first)
-            self.light_solver.start(first.observed, first.material, self.neilf.scene, first.lamp_trial)
+            start_with(self.neilf, self.light_solver, first)
 
     def _solve_light(self, step: int) -> None:
         """Bound β and fit the light if due, after the optimizer step as in the standalone loop."""
@@ -241,7 +248,7 @@ class NeilfMethod(Model):
         position = stage_at(step, self.config.neilf.train)
         if not is_search_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
             return
-        seed_step(self.config.neilf.train.seed, -6 - (step + 1))
+        seed_stream(self.config.neilf.train.seed, Stream.SEARCH, step + 1)
         summary = improve_material(self.neilf, light_places(self.neilf, self.pixels.on(self.device)))
         if summary is not None:
             CONSOLE.log(summary)
@@ -281,7 +288,7 @@ class NeilfMethod(Model):
         """The weighted losses of the stage; in evaluation mode the mean absolute error of the image."""
         if not self.training:
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
-        pixels = pixel_batch(outputs["origins"], outputs["directions"], batch)
+        pixels = to_pixel_batch(outputs["origins"], outputs["directions"], batch)
         computed = self.neilf.step(pixels, self.stage)
         terms = computed.terms
         self.computed = computed

@@ -22,7 +22,7 @@ from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.prepare.background import sigterm_as_ctrl_c, silent
-from neilfpp_method.prepare.layout import WORK, Source, lay_out
+from neilfpp_method.prepare.layout import WORK, PoseSource, lay_out
 from neilfpp_method.prepare.mapping import map_scene, refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing, extract_features, feature_counts, match_features
 from neilfpp_method.prepare.matching_copies import write_copies
@@ -132,7 +132,7 @@ def _check_readable(problems: tuple[str, ...], options: Prepare) -> None:
         raise unreadable(problems)
 
 
-def _from_capture(capture: Capture, options: Prepare) -> Source:
+def _from_capture(capture: Capture, options: Prepare) -> PoseSource:
     """The views of a capture with its own poses, and the points if it is a COLMAP model."""
     posed = posed_by_capture(capture)
     files = [path for view in posed.views for path in (view.image, view.mask, view.valid) if path]
@@ -144,10 +144,10 @@ def _from_capture(capture: Capture, options: Prepare) -> Source:
     points = None
     if capture.format == "colmap":
         points = sparse_points(open_model(model_folder(capture.root)))
-    return Source(posed, step, points)
+    return PoseSource(posed, step, points)
 
 
-def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, open_bar: Bars) -> Source:
+def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, open_bar: Bars) -> PoseSource:
     """The photographs with poses from structure from motion, after the merging of exposure brackets."""
     work = options.out / WORK
     merged = merge_photos(photos, brackets, options.response, work / "merged", open_bar) if brackets else None
@@ -186,4 +186,6 @@ def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, op
     cameras = describe_cameras(model)
     remarks = [f"left out: {problem}" for problem in problems] + remarks_on(placed, sizes, cameras)
     remarks = (*([merged.remark] if merged else []), *remarks)
-    return Source(posed_by_model(photos, model), step, sparse_points(model), placed, sizes, cameras, remarks)
+    return PoseSource(
+        posed_by_model(photos, model), step, sparse_points(model), placed, sizes, cameras, remarks
+    )

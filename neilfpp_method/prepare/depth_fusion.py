@@ -17,7 +17,7 @@ from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.data.views import Camera
 from neilfpp_method.prepare.depth_planes import OrientedDepth, fit_planes
 
-__all__ = ["fuse"]
+__all__ = ["fuse_depth_maps"]
 
 MAX_DISPARITY = 1.5
 """Largest difference of two inverse depths that agree, in steps of one pixel of disparity: the rounding of a
@@ -30,7 +30,7 @@ MIN_VIEWS = 2
 """Number of other views that must confirm a depth. A wrong depth rarely agrees with two others by chance."""
 
 
-def fuse(
+def fuse_depth_maps(
     cameras: Sequence[Camera],
     depths: Sequence[Float32[np.ndarray, "H W"]],
     steps: Sequence[float],

@@ -30,7 +30,7 @@ from neilfpp_method.prepare.sparse_cloud import SparsePoints, oriented, reliable
 from neilfpp_method.prepare.steps import Step, begin
 from neilfpp_method.prepare.summary import Placement, Summary, write_summary
 
-__all__ = ["WORK", "Source", "lay_out"]
+__all__ = ["WORK", "PoseSource", "lay_out"]
 
 WORK = "work"
 """Folder inside the capture's folder in which the steps keep their results."""
@@ -49,7 +49,7 @@ WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
 
 
 @dataclass(frozen=True)
-class Source:
+class PoseSource:
     """Posed views from which a capture is made, and where the poses come from.
 
     Attributes:
@@ -71,7 +71,15 @@ class Source:
     remarks: tuple[str, ...] = ()
 
 
-def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
+@dataclass(frozen=True)
+class _Cloud:
+    """The oriented points of a capture, possibly none, and a description of their source for the summary."""
+
+    points: WorldPoints
+    source: str
+
+
+def lay_out(source: PoseSource, options: Prepare, open_bar: Bars) -> Summary | None:
     """Write the folder of the capture with its summary.
 
     Returns:
@@ -80,7 +88,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     Raises:
         UserError: an image cannot be read, or the extent of the scene cannot be determined.
     """
-    work, posed = options.out / WORK, source.posed
+    work = options.out / WORK
     step = begin(work / "views", source.step, undistort=options.undistort)
     last = begin(
         work / "capture",
@@ -93,19 +101,7 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
     if last.result is not None and recognize(options.out):
         return None
     if step.result is None:
-        points = None
-        if source.points is not None and len(source.points):
-            points = source.points.position[reliable(source.points)]
-        views = write_views(
-            posed, step.folder, options.undistort, open_bar("writing images", len(posed.views)).advance
-        )
-        if posed.normalization:
-            box = SceneBox(posed.normalization, posed.scene_from)
-        else:
-            box = find_box(views, points)
-        files = CaptureFiles(step.folder, views, box.normalization, scene_from=box.source)
-        write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
-        step.complete({})
+        _write_posed_views(source, options, step, open_bar)
     prepared = load_capture(step.folder)
     bar = open_bar("inspecting", len(prepared.views))
     inspection = inspect_capture(prepared, lambda _: bar.advance())
@@ -116,17 +112,33 @@ def lay_out(source: Source, options: Prepare, open_bar: Bars) -> Summary | None:
         inspection = inspect_capture(prepared)
         remarks = (*source.remarks, *(f"left out: {name}, {reason}" for name, reason in rejected.items()))
         source = replace(source, remarks=remarks)
-    cloud, kind = _cloud(source, prepared, options, step, open_bar)
-    return _publish(source, prepared, cloud, kind, problems(inspection), options, last)
+    cloud = _cloud(source, prepared, options, step, open_bar)
+    summary = _publish(source, prepared, cloud, problems(inspection), options)
+    last.complete({})
+    return summary
 
 
-def _cloud(
-    source: Source, prepared: Capture, options: Prepare, after: Step, open_bar: Bars
-) -> tuple[WorldPoints, str]:
-    """The oriented points, and a description of their source for the summary."""
+def _write_posed_views(source: PoseSource, options: Prepare, step: Step, open_bar: Bars) -> None:
+    """Write the views with their scene box as a capture in the folder of a step, and complete the step."""
+    posed, points = source.posed, None
+    if source.points is not None and len(source.points):
+        points = source.points.position[reliable(source.points)]
+    bar = open_bar("writing images", len(posed.views))
+    views = write_views(posed, step.folder, options.undistort, bar.advance)
+    if posed.normalization:
+        box = SceneBox(posed.normalization, posed.scene_from)
+    else:
+        box = find_box(views, points)
+    files = CaptureFiles(step.folder, views, box.normalization, scene_from=box.source)
+    write_capture(step.folder, files, response="linear" if posed.linear else "srgb")
+    step.complete({})
+
+
+def _cloud(source: PoseSource, prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> _Cloud:
+    """The oriented points of the capture, from the best source that the options allow."""
     if options.cloud == "dense" or (options.cloud == "auto" and source.posed.cloud is None):
         try:
-            return _dense(prepared, options, after, open_bar), "dense: plane-sweep stereo"
+            return _Cloud(_dense(prepared, options, after, open_bar), "dense: plane-sweep stereo")
         except UserError as error:
             if options.cloud == "dense":
                 raise
@@ -134,10 +146,12 @@ def _cloud(
     else:
         no_dense = ""
     if source.posed.cloud is not None:
-        return without_outliers(read_oriented_ply(source.posed.cloud)), "given with the capture"
+        points = without_outliers(read_oriented_ply(source.posed.cloud))
+        return _Cloud(points, "given with the capture")
     if source.points is not None:
-        return oriented(source.points), f"sparse: structure from motion{no_dense}"
-    return WorldPoints(np.empty((0, 3)), np.empty((0, 3))), f"none: the poses came without points{no_dense}"
+        return _Cloud(oriented(source.points), f"sparse: structure from motion{no_dense}")
+    nothing = WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
+    return _Cloud(nothing, f"none: the poses came without points{no_dense}")
 
 
 def _dense(prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> WorldPoints:
@@ -151,13 +165,7 @@ def _dense(prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> 
 
 
 def _publish(
-    source: Source,
-    prepared: Capture,
-    cloud: WorldPoints,
-    kind: str,
-    problems: tuple[str, ...],
-    options: Prepare,
-    last: Step,
+    source: PoseSource, prepared: Capture, cloud: _Cloud, problems: tuple[str, ...], options: Prepare
 ) -> Summary:
     """Write the folder of the capture; `capture.json` is removed first and written last."""
     out = options.out
@@ -168,7 +176,8 @@ def _publish(
         copy = out / path.relative_to(prepared.root)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, copy)
-    points = write_oriented_ply(out / CLOUD, cloud) if len(cloud.position) else None
+    count = len(cloud.points.position)
+    points = write_oriented_ply(out / CLOUD, cloud.points) if count else None
     views = tuple(_relocate(view, prepared.root, out) for view in prepared.views)
     test = _test_views(source.posed, views, options.test_every)
     box = prepared.normalization
@@ -177,20 +186,19 @@ def _publish(
         models=source.models,
         cameras=source.cameras,
         views=len(views),
-        points=len(cloud.position),
-        cloud=kind,
+        points=count,
+        cloud=cloud.source,
         radius=box.scale,
         scene_from=prepared.scene_from,
         remarks=source.remarks,
         problems=problems,
     )
     write_summary(out / "summary.json", summary)
-    write_picture(out / "summary.png", views, test, cloud, box, source.placed)
+    write_picture(out / "summary.png", views, test, cloud.points, box, source.placed)
     files = CaptureFiles(out, views, box, points, scene_from=prepared.scene_from)
     write_capture(out, files, response="linear" if prepared.hdr else "srgb", test=test)
     for name in options.also:
         WRITERS[name](load_capture(out, format="neilfpp"), out / name)
-    last.complete({})
     return summary
 
 

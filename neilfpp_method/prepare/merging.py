@@ -16,7 +16,7 @@ from neilfpp_method.prepare.photos import MIN_PHOTOS, Photos, check_names
 from neilfpp_method.prepare.progress import Bar, Bars
 from neilfpp_method.prepare.steps import Step, begin, stamp
 
-__all__ = ["Merged", "brackets_among", "merge_photos"]
+__all__ = ["MergedPhotos", "brackets_among", "merge_photos"]
 
 IMAGES, VALID = "images", "valid"
 """Folders of the merged images and of their validity masks, inside the folder of the step."""
@@ -85,7 +85,7 @@ def _same_steps(brackets: Brackets) -> bool:
 
 
 @dataclass(frozen=True)
-class Merged:
+class MergedPhotos:
     """Merged images, in place of the photographs.
 
     Attributes:
@@ -105,7 +105,7 @@ def merge_photos(
     response: Literal["auto", "linear", "srgb"],
     folder: Path,
     open_bar: Bars,
-) -> Merged:
+) -> MergedPhotos:
     """Merge exposure brackets into linear images.
 
     A merged image has the camera and the focal length that EXIF gives for its middle exposure.
@@ -138,7 +138,7 @@ def merge_photos(
         remark += f"; {unused} photographs in no bracket were left out"
     if shifts := [shift for shift in step.result["moved"].values() if shift]:
         remark += f"; those of {len(shifts)} brackets were aligned, by up to {max(shifts):.1f} pixels"
-    return Merged(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
+    return MergedPhotos(replace(photos, root=folder, items=tuple(items), linear=True), step, remark)
 
 
 def _merge(

@@ -19,7 +19,16 @@ from neilfpp_method.data.raw import RAW_SUFFIXES, develop
 from neilfpp_method.data.views import plain_name
 from neilfpp_method.errors import UserError
 
-__all__ = ["MIN_PHOTOS", "Photo", "Photos", "Picture", "check_names", "read_photo", "survey", "unreadable"]
+__all__ = [
+    "MIN_PHOTOS",
+    "DecodedPhoto",
+    "Photo",
+    "Photos",
+    "check_names",
+    "read_photo",
+    "survey",
+    "unreadable",
+]
 
 MIN_PHOTOS = 3
 """Smallest number of photographs with which structure from motion is attempted."""
@@ -82,7 +91,7 @@ class Photos:
 
 
 @dataclass(frozen=True)
-class Picture:
+class DecodedPhoto:
     """The decoded pixels of a photograph.
 
     Attributes:
@@ -146,7 +155,7 @@ def unreadable(problems: Sequence[str]) -> UserError:
     )
 
 
-def read_photo(path: Path) -> Picture:
+def read_photo(path: Path) -> DecodedPhoto:
     """Decode a photograph.
 
     Raises:
@@ -154,11 +163,11 @@ def read_photo(path: Path) -> Picture:
     """
     if path.suffix.lower() in RAW_SUFFIXES:
         developed = develop(path)
-        return Picture(developed.pixels, developed.valid, None)
+        return DecodedPhoto(developed.pixels, developed.valid, None)
     image = read_image(path)
     pixels = np.repeat(image.pixels, 3, axis=2) if image.pixels.shape[2] == 1 else image.pixels
     usable = (np.isfinite(pixels) & (pixels >= 0)).all(axis=2)
-    return Picture(np.where(usable[..., None], pixels, np.float32(0)), usable, image.alpha)
+    return DecodedPhoto(np.where(usable[..., None], pixels, np.float32(0)), usable, image.alpha)
 
 
 def _is_photo(path: Path, root: Path) -> bool:

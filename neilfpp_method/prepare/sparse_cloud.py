@@ -88,8 +88,8 @@ def oriented(points: SparsePoints) -> WorldPoints:
     points = points[reliable(points)]
     if len(points) <= NEIGHBORS:
         return WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
-    normal, flat = estimate_normals(points.position, points.towards)
-    return WorldPoints(points.position[flat], normal[flat])
+    estimated = estimate_normals(points.position, points.towards)
+    return WorldPoints(points.position[estimated.flat], estimated.normal[estimated.flat])
 
 
 def without_outliers(points: WorldPoints) -> WorldPoints:
@@ -98,9 +98,20 @@ def without_outliers(points: WorldPoints) -> WorldPoints:
     return WorldPoints(points.position[good], points.normal[good])
 
 
+@dataclass(frozen=True)
+class EstimatedNormals:
+    """Unit normals of P points, and whether the neighbours of each point are flat.
+
+    They are flat if their smallest variance is at most a tenth (`MAX_FLATNESS`) of the next larger one.
+    """
+
+    normal: Float64[np.ndarray, "P 3"]
+    flat: Bool[np.ndarray, " P"]
+
+
 def estimate_normals(
     position: Float64[np.ndarray, "P 3"], towards: Float64[np.ndarray, "P 3"]
-) -> tuple[Float64[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
+) -> EstimatedNormals:
     """Estimate normals by principal component analysis of the nearest neighbours.
 
     The normal is the direction of the smallest variance of the neighbours.
@@ -108,17 +119,13 @@ def estimate_normals(
     Args:
         position: at least `NEIGHBORS` + 1 points.
         towards: for each point a direction; its normal has a non-negative dot product with it.
-
-    Returns:
-        Unit normals, and for each point whether its neighbours are flat: whether their smallest variance is
-        at most a tenth of the next larger one.
     """
     neighbors = cKDTree(position).query(position, k=NEIGHBORS + 1)[1]
     spread = position[neighbors] - position[neighbors].mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("pki,pkj->pij", spread, spread))
     normal = vectors[:, :, 0]
     normal = normal * np.where((normal * towards).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
-    return normal, values[:, 0] <= MAX_FLATNESS * values[:, 1]
+    return EstimatedNormals(normal, values[:, 0] <= MAX_FLATNESS * values[:, 1])
 
 
 def _not_isolated(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"]:

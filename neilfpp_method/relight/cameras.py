@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
@@ -16,7 +16,16 @@ from neilfpp_method.data.views import Camera, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["MAX_WIDTH", "Shot", "chosen_views", "rays_through", "resized", "turntable", "view_shots"]
+__all__ = [
+    "MAX_WIDTH",
+    "ImageRays",
+    "Shot",
+    "pixel_rays",
+    "rays_through",
+    "resized",
+    "turntable",
+    "view_shots",
+]
 
 MAX_WIDTH = 800
 """Largest default width, pixels, because a path-traced image of the size of a photograph takes long."""
@@ -41,22 +50,6 @@ class Shot:
     name: str
     camera: Camera
     view: View | None = None
-
-
-def chosen_views(capture: Capture, words: Sequence[str]) -> list[View]:
-    """The views that are named, in the capture's order; "test", "train" and "all" are sets of views.
-
-    Raises:
-        UserError: a word is neither a set nor the name of a view.
-    """
-    sets = {"test": capture.test_views, "train": capture.train_views, "all": capture.views}
-    by_name = {view.name: (view,) for view in capture.views}
-    for word in words:
-        if word not in sets and word not in by_name:
-            example = f"name views as {capture.views[0].name}, or give {', '.join(sets)} or turntable"
-            raise UserError(f"--views {word}: the capture has no view of this name", example)
-    chosen = {view.name for word in words for view in (sets.get(word) or by_name.get(word, ()))}
-    return [view for view in capture.views if view.name in chosen]
 
 
 def view_shots(capture: Capture, views: Sequence[View], scale: float | None, width: int | None) -> list[Shot]:
@@ -133,16 +126,25 @@ def resized(camera: Camera, factor: float) -> Camera:
     return replace(camera, **sizes, width=width, height=height)
 
 
-def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> tuple[RayBatch, Bool[Tensor, " N"]]:
+@dataclass(frozen=True)
+class ImageRays:
+    """Rays through points of an image, in the frame of the camera's pose.
+
+    Attributes:
+        rays: the rays.
+        valid: whether the lens shows anything at the point.
+    """
+
+    rays: RayBatch
+    valid: Bool[Tensor, " N"]
+
+
+def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> ImageRays:
     """Build rays through points of the image of a camera.
 
     Args:
         camera: the camera.
         points: image points (x, y), pixels; the centre of a pixel is at column + ½, row + ½.
-
-    Returns:
-        The rays, in the frame of the camera's pose, and a mask of the valid ones. A ray is invalid if the
-        lens shows nothing at its point.
     """
     plane = (points.double().cpu().numpy() - camera.intrinsics[2:]) / camera.intrinsics[:2]
     if camera.lens is not None:
@@ -155,7 +157,15 @@ def rays_through(camera: Camera, points: Float[Tensor, "N 2"]) -> tuple[RayBatch
     rays = RayBatch(
         *(torch.from_numpy(part.astype(np.float32)).to(points.device) for part in (origins, directions))
     )
-    return rays, torch.from_numpy(valid).to(points.device)
+    return ImageRays(rays, torch.from_numpy(valid).to(points.device))
+
+
+def pixel_rays(
+    camera: Camera, pixel: Int[Tensor, " N"], within: float | Float[Tensor, "*N 2"] = 0.5
+) -> ImageRays:
+    """Build a ray through each pixel, given by its row-major index, at a position in [0, 1]² of the pixel."""
+    corner = torch.stack((pixel % camera.width, pixel // camera.width), -1)
+    return rays_through(camera, corner + within)
 
 
 def _factor(camera: Camera, scale: float | None, width: int | None) -> float:

@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.mesh import check_resolution
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.relight.cameras import Shot, chosen_views, rays_through, turntable, view_shots
+from neilfpp_method.relight.cameras import Shot, pixel_rays, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
 from neilfpp_method.relight.denoise import check_denoiser, denoised
 from neilfpp_method.relight.edits import parse_edits, scene_box, with_edits
@@ -41,7 +42,6 @@ from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.output import check_folder
 from neilfpp_method.train.run import Run, load_run
 
@@ -148,6 +148,18 @@ def relight(
 
 def _check(request: RelightRequest) -> None:
     """Check everything that does not need the run."""
+    _check_numbers(request)
+    _check_combinations(request)
+    if request.denoise:
+        check_denoiser()
+    parse_edits(request.edits)
+    parse_lamp_edits(request.lamp_edits)
+    for path in request.env:
+        check_map(path)
+    map_names(request.env)
+
+
+def _check_numbers(request: RelightRequest) -> None:
     positive = {
         "--spp": request.spp,
         "--seconds": request.seconds,
@@ -170,6 +182,11 @@ def _check(request: RelightRequest) -> None:
         raise UserError(
             f"--exposure is {request.exposure}", f"give between −{MAX_EXPOSURE} and {MAX_EXPOSURE} stops"
         )
+
+
+def _check_combinations(request: RelightRequest) -> None:
+    """Reject options that exclude each other, or that have no effect without another one."""
+    circle, sized = TURNTABLE in request.views, request.scale is not None or request.width is not None
     if request.scale is not None and request.width is not None:
         raise UserError("--scale and --width both set the size of views", "give only one of them")
     for option, given in (("--box", request.box is not None), ("--mask", bool(request.mask))):
@@ -180,33 +197,25 @@ def _check(request: RelightRequest) -> None:
             )
     if request.lamp_edits and request.lamps == "drop":
         raise UserError("--lamp changes lamps, but --lamps drop removes all of them", "give only one of both")
-    if TURNTABLE in request.views and len(request.views) > 1:
+    if circle and len(request.views) > 1:
         raise UserError("--views turntable is a circle, and no other views go with it", "give one of them")
-    if request.truth:
-        if TURNTABLE in request.views or request.scale is not None or request.width is not None:
-            raise UserError(
-                "true images can only be compared with views in full size",
-                "leave --views turntable, --scale and --width out",
-            )
-        if len(request.truth) != max(1, len(request.env)):
-            raise UserError(
-                f"{len(request.truth)} folders of true images for {len(request.env)} maps",
-                "give one folder for each map",
-            )
-    if request.denoise:
-        check_denoiser()
-    parse_edits(request.edits)
-    parse_lamp_edits(request.lamp_edits)
-    for path in request.env:
-        check_map(path)
-    map_names(request.env)
+    if request.truth and (circle or sized):
+        raise UserError(
+            "true images can only be compared with views in full size",
+            "leave --views turntable, --scale and --width out",
+        )
+    if request.truth and len(request.truth) != max(1, len(request.env)):
+        raise UserError(
+            f"{len(request.truth)} folders of true images for {len(request.env)} maps",
+            "give one folder for each map",
+        )
 
 
 def _shots(request: RelightRequest, run: Run) -> list[Shot]:
     capture = run.capture
     if TURNTABLE in request.views:
         return turntable(capture, request.frames, request.scale, request.width)
-    views = chosen_views(capture, request.views)
+    views = capture.chosen_views(request.views)
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 
 
@@ -305,9 +314,8 @@ def _render(
 def _over_sky(picture: Picture, sky: Sky, shot: Shot) -> Picture:
     """Composite the image over the environment map."""
     height, width = picture.alpha.shape[:2]
-    pixel = torch.arange(height * width, device=picture.alpha.device)
-    rays, valid = rays_through(shot.camera, torch.stack((pixel % width, pixel // width), -1) + 0.5)
-    background = (sky.lookup(rays.directions) * valid[:, None]).view(height, width, 3)
+    seen = pixel_rays(shot.camera, torch.arange(height * width, device=picture.alpha.device))
+    background = (sky.lookup(seen.rays.directions) * seen.valid[:, None]).view(height, width, 3)
     radiance = picture.radiance + (1 - picture.alpha) * background
     return dataclasses.replace(picture, radiance=radiance, alpha=torch.ones_like(picture.alpha))
 

@@ -28,7 +28,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.shading.color import srgb_to_linear, tone_map
 
-__all__ = ["Comparison", "TrueImage", "compare", "find_truth", "read_truth"]
+__all__ = ["RelitComparison", "TrueImage", "compare", "find_truth", "read_truth"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TrueImage:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class RelitComparison:
     """The result of a comparison.
 
     Attributes:
@@ -117,7 +117,7 @@ def compare(
     relit: Sequence[Float[np.ndarray, "H W 3"]],
     opacity: Sequence[Float[np.ndarray, "H W"]],
     truth: Sequence[TrueImage],
-) -> Comparison:
+) -> RelitComparison:
     """Compute the figures of relit views against the true images.
 
     Args:
@@ -135,20 +135,28 @@ def compare(
             "no pixel of the true images shows a surface", "give images of the views, with their masks"
         )
     images, names = [true.image for true in truth], [true.name for true in truth]
-    figures, views, scale = _figures("relight", relit, images, masks, names)
-    baseline, _, _ = _figures("baseline", [true.photograph for true in truth], images, masks, names)
+    ours = _scores("relight", relit, images, masks, names)
+    baseline = _scores("baseline", [true.photograph for true in truth], images, masks, names)
     sources = sorted({true.mask_source for true in truth})
-    return Comparison(figures | baseline, views, scale, ", ".join(sources))
+    return RelitComparison(ours.figures | baseline.figures, ours.views, ours.scale, ", ".join(sources))
 
 
-def _figures(
+@dataclass(frozen=True)
+class _Scores:
+    """Figures averaged over the views with a non-empty mask, scaled PSNR of each view, and the factors."""
+
+    figures: dict[str, float]
+    views: dict[str, float]
+    scale: tuple[float, ...]
+
+
+def _scores(
     title: str,
     estimates: Sequence[np.ndarray],
     images: Sequence[np.ndarray],
     masks: Sequence[np.ndarray],
     names: Sequence[str],
-) -> tuple[dict[str, float], dict[str, float], tuple[float, ...]]:
-    """Figures averaged over the views with a non-empty mask, scaled PSNR of each view, and the factors."""
+) -> _Scores:
     pooled = [
         np.concatenate([image[mask] for image, mask in zip(side, masks, strict=True)])
         for side in (estimates, images)
@@ -174,7 +182,7 @@ def _figures(
             if suffix:
                 views[name] = values["psnr"]
     figures = {key: float(np.mean(values)) for key, values in scores.items()}
-    return figures, views, tuple(float(s) for s in scale)
+    return _Scores(figures, views, tuple(float(s) for s in scale))
 
 
 def _linear(pixels: Float[np.ndarray, "H W C"], linear: bool) -> Float[np.ndarray, "H W 3"]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import monotonic
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.views import Camera
-from neilfpp_method.relight.cameras import rays_through
+from neilfpp_method.relight.cameras import pixel_rays
 from neilfpp_method.relight.path_tracer import DIMENSIONS, Scene, trace_paths
 from neilfpp_method.relight.sequence import Numbers, Sequence
 
@@ -64,7 +64,6 @@ def render_picture(
     bounces: int,
     seed: int = 0,
     on_progress: Callable[[float], None] = lambda share: None,
-    clock: Callable[[], float] = time.monotonic,
 ) -> Picture:
     """Render an image by path tracing, with a box filter of one pixel.
 
@@ -75,7 +74,6 @@ def render_picture(
         bounces: largest number of surface vertices of a path (`trace_paths`).
         seed: the same seed and number of samples give the same image.
         on_progress: called with the fraction of the work that is done.
-        clock: returns the time in seconds.
 
     Example::
 
@@ -84,13 +82,13 @@ def render_picture(
         picture = render_picture(scene, camera, Budget(samples=64), bounces=4)
     """
     device = scene.sky.radiance.device
-    pixels, begun = camera.width * camera.height, clock()
+    pixels, begun = camera.width * camera.height, monotonic()
     max_samples = budget.samples or MAX_SAMPLES
     sequence = Sequence(PIXEL_DIMENSIONS + bounces * DIMENSIONS, seed)
     sums = torch.zeros(pixels, 10, dtype=torch.float64, device=device)
     done = 0
     while done < max_samples:
-        elapsed = clock() - begun
+        elapsed = monotonic() - begun
         if done and budget.seconds is not None and elapsed >= budget.seconds:
             break
         block = min(max(1, PATHS_AT_ONCE // pixels), max_samples - done)
@@ -99,7 +97,7 @@ def render_picture(
             part = numbers.of(paths)
             sums.index_add_(0, part.pixel, _samples(scene, camera, part, bounces))
             of_samples = (done + (paths[-1].item() + 1) / pixels) / max_samples
-            of_time = 0.0 if budget.seconds is None else (clock() - begun) / budget.seconds
+            of_time = 0.0 if budget.seconds is None else (monotonic() - begun) / budget.seconds
             on_progress(min(1.0, max(of_samples, of_time)))
         done += block
     mean = (sums / done).float().view(camera.height, camera.width, 10)
@@ -110,8 +108,7 @@ def render_picture(
 def _samples(scene: Scene, camera: Camera, numbers: Numbers, bounces: int) -> Float[Tensor, "N 10"]:
     """Radiance, alpha, albedo and normal of one sample for each path."""
     paths = torch.arange(len(numbers.pixel), device=numbers.pixel.device)
-    corner = torch.stack((numbers.pixel % camera.width, numbers.pixel // camera.width), -1)
-    rays, valid = rays_through(camera, corner + numbers.at(paths, 0, PIXEL_DIMENSIONS))
-    traced = trace_paths(scene, rays, numbers, bounces, PIXEL_DIMENSIONS)
+    drawn = pixel_rays(camera, numbers.pixel, numbers.at(paths, 0, PIXEL_DIMENSIONS))
+    traced = trace_paths(scene, drawn.rays, numbers, bounces, PIXEL_DIMENSIONS)
     values = torch.cat((traced.radiance, traced.alpha[:, None], traced.albedo, traced.normal), -1)
-    return (values * valid[:, None]).double()
+    return (values * drawn.valid[:, None]).double()

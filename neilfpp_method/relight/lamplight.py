@@ -13,7 +13,7 @@ from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.shading.frame import local_frame, safe_normalize
 
-__all__ = ["LampSample", "Lamplight", "lamps_of_run"]
+__all__ = ["LampHits", "LampSample", "Lamplight", "lamps_of_run"]
 
 EVEN_SHARE = 0.05
 """Part of a lamp's selection probability that does not depend on its axis. The emission along the axis is
@@ -34,6 +34,14 @@ class LampSample:
 
     wi: Float[Tensor, "N 3"]
     pdf: Float[Tensor, " N"]
+    distance: Float[Tensor, " N"]
+    radiance: Float[Tensor, "N 3"]
+
+
+@dataclass(frozen=True)
+class LampHits:
+    """Distance at which rays hit a lamp, infinite if they miss it, and the radiance from there."""
+
     distance: Float[Tensor, " N"]
     radiance: Float[Tensor, "N 3"]
 
@@ -73,31 +81,29 @@ class Lamplight:
         local = torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), cosine), -1)
         wi = safe_normalize((local[:, :, None] * local_frame(safe_normalize(offset))).sum(1))
         pdf = probability.gather(1, lamp)[:, 0] * _cone_pdf(one_minus_cosine)
-        distance, radiance = self._intersect(x, wi, lamp[:, 0])
+        hits = self._intersect(x, wi, lamp[:, 0])
         # Rounding can move a direction at the rim off the sphere; such a sample is invalid.
-        return LampSample(wi, torch.where(distance.isfinite(), pdf, 0.0), distance, radiance)
+        return LampSample(wi, torch.where(hits.distance.isfinite(), pdf, 0.0), hits.distance, hits.radiance)
 
     def pdf(self, x: Float[Tensor, "N 3"], lamp: int) -> Float[Tensor, " N"]:
         """Density of `sample`, per steradian, at directions that hit a given lamp."""
         cone = _cone_pdf(self._one_minus_cosine(self.position[lamp] - x))
         return self._probabilities(x)[:, lamp] * cone
 
-    def intersect(
-        self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: int
-    ) -> tuple[Tensor, Tensor]:
-        """Distance (N,) at which rays hit a lamp, infinite if they miss it, and radiance (N, 3) from it."""
+    def intersect(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: int) -> LampHits:
+        """Intersect rays with one lamp."""
         return self._intersect(x, wi, torch.full_like(x[:, 0], lamp, dtype=torch.int64))
 
     def _intersect(
         self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N 3"], lamp: Int[Tensor, " N"]
-    ) -> tuple[Tensor, Tensor]:
+    ) -> LampHits:
         offset = self.position[lamp] - x
         along = (offset * wi).sum(-1)
         miss = (offset - along[:, None] * wi).square().sum(-1)
         outside = offset.square().sum(-1) > self.radius**2
         hit = outside & (along > 0) & (miss < self.radius**2)
         distance = torch.where(hit, along - (self.radius**2 - miss).clamp_min(0).sqrt(), torch.inf)
-        return distance, (hit * self._emission(wi, lamp))[:, None] * self.radiance[lamp]
+        return LampHits(distance, (hit * self._emission(wi, lamp))[:, None] * self.radiance[lamp])
 
     def _emission(self, wi: Float[Tensor, "*B 3"], lamp: Int[Tensor, "*L"]) -> Float[Tensor, "*B"]:
         """Emission of lamps towards the origin of rays, relative to that along the axis."""

@@ -201,8 +201,8 @@ def _from_hit_lights(
     light = scene.sky.lookup(wi) * (unoccluded * power_heuristic(pdf, scene.sky.pdf(wi)))[:, None]
     lamps = scene.lamps
     for lamp in range(0 if lamps is None else len(lamps.position)):
-        distance, radiance = lamps.intersect(origins, wi, lamp)
-        rows = torch.nonzero(distance < nearest)[:, 0]
+        met = lamps.intersect(origins, wi, lamp)
+        rows = torch.nonzero(met.distance < nearest)[:, 0]
         weight = power_heuristic(pdf[rows], lamps.pdf(origins[rows], lamp))
-        light = light.index_add(0, rows, radiance[rows] * weight[:, None])
+        light = light.index_add(0, rows, met.radiance[rows] * weight[:, None])
     return light

@@ -13,11 +13,12 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.cameras import Shot
 from neilfpp_method.relight.film import Picture
 from neilfpp_method.shading.color import tone_map
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 
 __all__ = ["PictureFolder", "StoredPicture"]
 

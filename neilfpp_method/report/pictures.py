@@ -19,36 +19,6 @@ def views_section(views: ReportViews, held_out: bool) -> Html:
         held_out: whether the views were held out of training.
     """
     names = list(views.names)
-    block = {
-        "names": names,
-        "photographs": list(views.photographs),
-        "layers": [
-            {
-                "title": layer.title,
-                "note": layer.note,
-                "largest": layer.largest,
-                "cells": [{"truth": cell.truth, "error": cell.error} for cell in layer.cells],
-            }
-            for layer in views.layers
-        ],
-    }
-    first = views.layers[0]
-    width = f"min(100%, calc(68vh * {views.width / views.height:.4f}))"
-    stage = element(
-        "div",
-        element("img", class_="before", src=views.photographs[0], alt=f"Photograph, view {names[0]}"),
-        element(
-            "img",
-            class_="after",
-            src=first.cells[0].estimate,
-            alt=f"{first.title}, estimate, view {names[0]}",
-        ),
-        element("span", "photograph", class_="tag left"),
-        element("span", "estimate", class_="tag right"),
-        element("input", type="range", min=0, max=100, value=50, aria_label="Border between the two images"),
-        class_="stage",
-        style=f"width: {width}; aspect-ratio: {views.width} / {views.height}",
-    )
     strips = (
         element(
             "div",
@@ -68,11 +38,43 @@ def views_section(views: ReportViews, held_out: bool) -> Html:
         _choices("view", "View", names),
         _choices("layer", "Map", [layer.title for layer in views.layers]),
         _choices("beside", "Compare with", ["truth", "photograph", "error"], values=True),
-        element("figure", stage, element("figcaption", id="views-caption", aria_live="polite")),
+        element("figure", _stage(views), element("figcaption", id="views-caption", aria_live="polite")),
         *strips,
         element("noscript", element("p", "Without JavaScript this page shows only the estimates.")),
-        data_block("views-data", block),
+        data_block("views-data", _views_data(views)),
     )
+
+
+def _stage(views: ReportViews) -> Html:
+    """Photograph and first estimate of the first view with the slider between them."""
+    first, name = views.layers[0], views.names[0]
+    width = f"min(100%, calc(68vh * {views.width / views.height:.4f}))"
+    return element(
+        "div",
+        element("img", class_="before", src=views.photographs[0], alt=f"Photograph, view {name}"),
+        element(
+            "img", class_="after", src=first.cells[0].estimate, alt=f"{first.title}, estimate, view {name}"
+        ),
+        element("span", "photograph", class_="tag left"),
+        element("span", "estimate", class_="tag right"),
+        element("input", type="range", min=0, max=100, value=50, aria_label="Border between the two images"),
+        class_="stage",
+        style=f"width: {width}; aspect-ratio: {views.width} / {views.height}",
+    )
+
+
+def _views_data(views: ReportViews) -> dict[str, Any]:
+    """What the script of the page needs to exchange the images of the slider."""
+    layers = [
+        {
+            "title": layer.title,
+            "note": layer.note,
+            "largest": layer.largest,
+            "cells": [{"truth": cell.truth, "error": cell.error} for cell in layer.cells],
+        }
+        for layer in views.layers
+    ]
+    return {"names": list(views.names), "photographs": list(views.photographs), "layers": layers}
 
 
 def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from neilfpp_method.export.asset.clean import clean
-from neilfpp_method.export.asset.surface import Surface, creased, fine_surface
+from neilfpp_method.export.asset.surface import AssetSurface, creased, fine_surface
 from neilfpp_method.export.asset.visible import visible_faces
 from neilfpp_method.export.mesh import materials_in_parts
 from neilfpp_method.shading.color import tone_map
@@ -80,7 +80,7 @@ def packed_surface(run: Run) -> dict[str, Any]:
     return packed
 
 
-def _corners(surface: Surface) -> tuple[np.ndarray, np.ndarray]:
+def _corners(surface: AssetSurface) -> tuple[np.ndarray, np.ndarray]:
     """Positions and normals of the corners of all triangles; large triangles are subdivided first."""
     if len(surface.faces) > FACES / 2:
         return surface.vertices[surface.faces].reshape(-1, 3), surface.normals.reshape(-1, 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from neilfpp_method.evaluate.glossary import explain
+from neilfpp_method.evaluate.glossary import style_of
 from neilfpp_method.health.cases import Finding, verdict_of
 from neilfpp_method.report.curves import quality_curve, work_bars
 from neilfpp_method.report.files import Changed
@@ -100,18 +100,18 @@ def figures_section(metrics: Mapping[str, float], description: str) -> Html:
     for name in metrics:
         if name in in_other_rows:
             continue
-        entry = explain(name)
+        style = style_of(name)
         keys = (name, *(companions[name][k] for k in filled))
-        value, *others = (entry.format(metrics[key]) if key in metrics else "–" for key in keys)
-        symbol = {"higher": "↑", "lower": "↓"}.get(entry.better)
-        arrow = (" ", element("span", symbol, title=f"{entry.better} is better")) if symbol else ()
+        value, *others = (style.format(metrics[key]) if key in metrics else "–" for key in keys)
+        symbol = {"higher": "↑", "lower": "↓"}.get(style.better)
+        arrow = (" ", element("span", symbol, title=f"{style.better} is better")) if symbol else ()
         rows.append(
             element(
                 "tr",
-                element("th", entry.title, element("br"), element("code", name), scope="row"),
+                element("th", style.title, element("br"), element("code", name), scope="row"),
                 element("td", element("b", value), *arrow, class_="number"),
                 *(element("td", other, class_="number") for other in others),
-                element("td", entry.meaning),
+                element("td", style.meaning),
             )
         )
     names = ("figure", "this run", *(titles[k] for k in filled), "meaning")

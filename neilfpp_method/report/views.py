@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from neilfpp_method.data.scaling import at_scale, file_size
-from neilfpp_method.evaluate.confidence import gather_evidence, with_deviation
+from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.map_metrics import image_metrics, material_metrics, normal_metrics
 from neilfpp_method.evaluate.panels import ComparedMap, albedo_scale, compared_maps
@@ -159,8 +159,8 @@ def compare_views(run: Run, confidence: bool, on_progress: Callable[[float], Non
     pairs = [(r, k) for r, k in zip(rendered, known, strict=True) if k.mask.any()]
     figures = image_metrics(run, pairs) | material_metrics(run, pairs) | normal_metrics(pairs)
     if confidence and run.has_material and run.capture.train_views:
-        evidence = gather_evidence(run)
-        rendered = [with_deviation(run, evidence, view, CONFIDENCE_STEP) for view in rendered]
+        residuals = measure_residuals(run)
+        rendered = [with_deviation(run, residuals, view, CONFIDENCE_STEP) for view in rendered]
     maps = tuple(compared_maps(run, rendered, known, scale))
     return ComparedViews(tuple(rendered), scale, maps, figures, held.mask_source)
 

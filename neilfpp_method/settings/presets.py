@@ -63,7 +63,6 @@ PAPER_NGP: Mapping[str, Any] = {
     "optimizer.radiance": 1e-2,
     "optimizer.brdf": 1e-2,
     "optimizer.light": 1e-2,
-    "optimizer.background": 1e-2,
     "optimizer.beta": 1e-2,
     "optimizer.joint": 0.1,
     "optimizer.final": (0.1, 0.1, 0.01),
@@ -162,7 +161,6 @@ FAST: Mapping[str, Any] = {
     "optimizer.radiance": 5e-3,
     "optimizer.brdf": 5e-3,
     "optimizer.light": 3e-2,
-    "optimizer.background": 5e-3,
     "optimizer.beta": 1e-3,
     "optimizer.exposure": EXPOSURE_RATE,
     "optimizer.joint": 0.1,
@@ -282,8 +280,6 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     - Stages: R is trained first for a few steps, because light between surfaces influences the choice of the
       light; then R, B and L are trained together, in twice as many steps, because R is new as well.
     - R gets no feature of G, so it encodes positions itself; 8×128 is the paper's surface light field.
-    - A mesh is not a soft layer: rays may start close to it, and R is accurate enough to be trained by L_ref
-      (METHOD §2, §4).
     - The normals are given: they are not smoothed, and R need not support their recovery.
     - Rays through a mesh are cheap, so the light is solved for more often.
     """
@@ -293,7 +289,6 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         "host": {"kind": MeshConfig().kind},
         "radiance": {"positions": "encoded", "layers": 8, "width": 128, "direction": "outgoing"},
         "volume.normal_radius": 0.0,
-        "inter_reflection": {"radiance_gradient": 0.7, "offset": 2e-3},
         "loss.lambertian": 10.0 * config.loss.lambertian,
         "train.sdf_steps": train.sdf_steps // 10,
         "train.material_steps": 2 * (train.material_steps + train.joint_steps),
@@ -316,7 +311,6 @@ PAPER_MESH: Mapping[str, Any] = {
     "optimizer.radiance": 2e-3,
     "optimizer.brdf": 2e-3,
     "optimizer.light": 2e-3,
-    "optimizer.background": 2e-3,
     "optimizer.beta": 2e-3,
     "optimizer.joint": 1.0,
     "optimizer.final": (1.0, 1.0, 0.04),

@@ -14,6 +14,13 @@ import tyro
 
 __all__ = ["NeilfConfig"]
 
+SOFT_OFFSET = 0.02
+"""Height above a volume-rendered surface at which secondary rays start, scene units, before its width is
+added.
+"""
+MESH_OFFSET = 2e-3
+"""The same for a mesh, which has no soft layer; a ray that started on a triangle could hit it by rounding."""
+
 
 # ----------------------------------------------------------------------------------------------------- fields
 
@@ -257,10 +264,6 @@ class InterReflectionConfig:
     """
     rays_per_point: float = 1.0
     """Expected number of traced rays per surface point and step, for L_ref."""
-    radiance_gradient: float = 0.0
-    """Scale of the gradient of L_ref into R. 0 detaches R; 0.7 suits fixed geometry."""
-    offset: float = 0.02
-    """Minimum distance from the surface at which rays start; it grows with β and as 1/cos θ."""
 
 
 # --------------------------------------------------------------------------------------------------- training
@@ -291,8 +294,6 @@ class LossConfig:
     """Weight of L_surf in the joint stage."""
     point_cloud: float = 0.0
     """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
-    inter_reflection: float = 0.1
-    """Weight of L_ref: L and R agree along rays between surfaces."""
     smoothness: float = 5e-4
     """Weight of L_smth: roughness and metallic are smooth where the image is."""
     lambertian: float = 5e-4
@@ -317,13 +318,11 @@ class OptimizerConfig:
     geometry: float = 1e-3
     """Learning rate of G."""
     radiance: float = 1e-3
-    """Learning rate of R."""
+    """Learning rate of R and of the background field."""
     brdf: float = 1e-3
     """Learning rate of B."""
     light: float = 1e-3
     """Learning rate of L, if it is a network."""
-    background: float = 1e-3
-    """Learning rate of the background field."""
     beta: float = 1e-3
     """Learning rate of the density's scale β."""
     exposure: float = 0.0
@@ -385,3 +384,8 @@ class NeilfConfig:
     def known_map(self) -> str | None:
         """File of the given environment map; None if the light is recovered."""
         return self.light.map if isinstance(self.light, MapLightConfig) else None
+
+    @property
+    def ray_offset(self) -> float:
+        """Height above the surface at which rays to other surfaces start, scene units."""
+        return MESH_OFFSET if isinstance(self.host, MeshConfig) else SOFT_OFFSET

@@ -26,11 +26,11 @@ __all__ = ["EVERY", "PREPARATION", "WORK", "Ledger", "Work", "recording", "timed
 Work = Literal[
     "data",
     "rendering",
-    "regularisers",
+    "regularizers",
     "tracing",
     "shading",
     "gradients",
-    "optimiser",
+    "optimizer",
     "light_fits",
     "checks",
     "saving",
@@ -40,11 +40,11 @@ Work = Literal[
 
 - data: drawing pixels;
 - rendering: camera rays through the host;
-- regularisers: losses that depend only on geometry or material;
+- regularizers: losses that depend only on geometry or material;
 - tracing: rays that leave surfaces;
 - shading: material, light and the rendering equation;
 - gradients: the backward pass of all of these;
-- optimiser: the optimizer step and its bookkeeping;
+- optimizer: the optimizer step and its bookkeeping;
 - light_fits: fits of the map and the lamps, and searches for materials under them;
 - checks: previews and measurements during training;
 - saving: checkpoints;

@@ -11,7 +11,7 @@ from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.tradeoff.files import write_tradeoff
-from neilfpp_method.tradeoff.frontier import FIGURES, Point, frontier
+from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult, frontier
 from neilfpp_method.tradeoff.rows import TradeoffRequest, check_same, measured, rows_of, run_row
 from neilfpp_method.train.output import check_folder
 
@@ -20,7 +20,7 @@ __all__ = ["run_tradeoff"]
 
 def run_tradeoff(
     request: TradeoffRequest, console: Console, at_end: Callable[[Path], None] | None = None
-) -> list[Point]:
+) -> list[BudgetResult]:
     """Train and evaluate all runs that are not finished, one after the other, and write the frontier.
 
     The files are written again after each run. A budget that is too small for this machine is reported,
@@ -62,13 +62,13 @@ def run_tradeoff(
     if not runs:
         raise UserError(f"{out}: no run could be made", refused)
     points = frontier(runs)
-    for line in table(points):
+    for line in frontier_table(points):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg", soft_wrap=True)
     return points
 
 
-def table(points: Sequence[Point]) -> list[str]:
+def frontier_table(points: Sequence[BudgetResult]) -> list[str]:
     """The frontier for the terminal: a line per budget, followed by the change of each metric per minute."""
     names = [name for name in FIGURES if points and name in points[0].figures]
     lines = ["budget      took   " + "  ".join(f"{FIGURES[name].title:>20}" for name in names)]
@@ -82,6 +82,6 @@ def table(points: Sequence[Point]) -> list[str]:
     return lines
 
 
-def _with_deviation(point: Point, name: str) -> str:
+def _with_deviation(point: BudgetResult, name: str) -> str:
     value = f"{point.figures[name]:.2f}"
     return value + (f" ± {point.deviations[name]:.2f}" if name in point.deviations else "")

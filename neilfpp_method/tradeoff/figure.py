@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.report.markup import Html, element
-from neilfpp_method.tradeoff.frontier import FIGURES, Point
+from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult
 
 __all__ = ["draw_frontier"]
 
@@ -21,7 +21,7 @@ INK, PALE, LINE, GRAY = "#1c1e22", "#5c626b", "#4477aa", "#aaaaaa"
 """Colours of text, of secondary text, of the curve, and of the labels of dominated points."""
 
 
-def draw_frontier(title: str, points: Sequence[Point]) -> str:
+def draw_frontier(title: str, points: Sequence[BudgetResult]) -> str:
     """Draw the frontier.
 
     The time axis is logarithmic. Error bars are one standard deviation over the seeds to either side.
@@ -47,7 +47,7 @@ def draw_frontier(title: str, points: Sequence[Point]) -> str:
     return element("svg", paper, heading, *panels, **frame, **size) + "\n"
 
 
-def _panel(name: str, points: Sequence[Point]) -> list[Html]:
+def _panel(name: str, points: Sequence[BudgetResult]) -> list[Html]:
     figure = FIGURES[name]
     ends = [
         point.figures[name] + sign * point.deviations.get(name, 0.0) for point in points for sign in (-1, 1)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.images import replacing
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.tradeoff.figure import draw_frontier
-from neilfpp_method.tradeoff.frontier import FIGURES, Measured, frontier
-from neilfpp_method.train.json_files import write_json
+from neilfpp_method.tradeoff.frontier import FIGURES, RunResult, frontier
 from neilfpp_method.train.provenance import provenance
 
 __all__ = ["write_tradeoff"]
@@ -21,7 +21,7 @@ FORMAT = 1
 """Version of the layout of `tradeoff.json`."""
 
 
-def write_tradeoff(out: Path, title: str, runs: Sequence[Measured]) -> None:
+def write_tradeoff(out: Path, title: str, runs: Sequence[RunResult]) -> None:
     """Write the three files, each atomically."""
     points = frontier(runs)
     names = [name for name in FIGURES if any(name in run.figures for run in runs)]

@@ -9,7 +9,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-__all__ = ["FIGURES", "Measured", "Point", "frontier"]
+__all__ = ["FIGURES", "BudgetResult", "RunResult", "frontier"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ held-back pixels of training views (`train.quality`) and always present.
 
 
 @dataclass(frozen=True)
-class Measured:
+class RunResult:
     """The result of a finished run.
 
     Attributes:
@@ -50,7 +50,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Point:
+class BudgetResult:
     """The result of a budget.
 
     Attributes:
@@ -74,11 +74,11 @@ class Point:
     dominated: bool
 
 
-def frontier(runs: Sequence[Measured]) -> list[Point]:
+def frontier(runs: Sequence[RunResult]) -> list[BudgetResult]:
     """The points of a frontier, by budget."""
     common = set(FIGURES).intersection(*(run.figures for run in runs)) if runs else set()
     names = [name for name in FIGURES if name in common]
-    by_budget: dict[float, list[Measured]] = {}
+    by_budget: dict[float, list[RunResult]] = {}
     for run in sorted(runs, key=lambda run: run.budget):
         by_budget.setdefault(run.budget, []).append(run)
     means = {
@@ -95,7 +95,9 @@ def frontier(runs: Sequence[Measured]) -> list[Point]:
         }
         others = [other for other in by_budget if other != budget and took[other] <= took[budget]]
         dominated = any(_dominates(means[other], means[budget], names) for other in others)
-        points.append(Point(budget, took[budget], len(group), means[budget], spread, gained, dominated))
+        points.append(
+            BudgetResult(budget, took[budget], len(group), means[budget], spread, gained, dominated)
+        )
         before = budget
     return points
 

@@ -17,7 +17,7 @@ from neilfpp_method.report.files import flat_settings
 from neilfpp_method.report.measured import is_outdated
 from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.tradeoff.frontier import FIGURES, Measured
+from neilfpp_method.tradeoff.frontier import FIGURES, RunResult
 from neilfpp_method.train.budget_record import read_budget
 from neilfpp_method.train.budgeted import planned_settings
 from neilfpp_method.train.command import run_training
@@ -29,7 +29,7 @@ from neilfpp_method.train.quality import read_checks
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
-__all__ = ["Row", "TradeoffRequest", "check_same", "measured", "rows_of", "run_row"]
+__all__ = ["PlannedRun", "TradeoffRequest", "check_same", "measured", "rows_of", "run_row"]
 
 METRICS = "metrics.json"
 """File of a run with its metrics on test views."""
@@ -57,7 +57,7 @@ class TradeoffRequest:
 
 
 @dataclass(frozen=True)
-class Row:
+class PlannedRun:
     """Description of a run to make.
 
     Attributes:
@@ -82,7 +82,7 @@ class Row:
         return self.out.name
 
 
-def rows_of(request: TradeoffRequest) -> list[Row]:
+def rows_of(request: TradeoffRequest) -> list[PlannedRun]:
     """A row for each budget and seed, in order of budget, with folders `OUT/10m-seed0` and so on.
 
     Raises:
@@ -99,11 +99,11 @@ def rows_of(request: TradeoffRequest) -> list[Row]:
         for seed in range(config.train.seed, config.train.seed + request.seeds):
             out = request.out / f"{format_duration(budget)}-seed{seed}"
             seeded = replace(config, train=replace(config.train, seed=seed))
-            rows.append(Row(request.data, out, seeded, effects, budget, request.device))
+            rows.append(PlannedRun(request.data, out, seeded, effects, budget, request.device))
     return rows
 
 
-def check_same(row: Row) -> None:
+def check_same(row: PlannedRun) -> None:
     """Check that the folder of a row, if it contains a run, contains the run that the row describes.
 
     The numbers of steps and the settings that depend on the size of a step (`budget.sizes`) are compared with
@@ -140,7 +140,7 @@ def _compared(
     return {**capture, **settings, "--effects": effects, "the budget in seconds": budget}
 
 
-def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
+def run_row(row: PlannedRun, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
     """Train and evaluate a run, or only the parts that are missing.
 
     Raises:
@@ -165,7 +165,7 @@ def run_row(row: Row, console: Console, at_end: Callable[[Path], None] | None = 
             write_metrics(row.out / METRICS, run, evaluate(run))
 
 
-def measured(row: Row) -> Measured | None:
+def measured(row: PlannedRun) -> RunResult | None:
     """The result of a run; None if it is not finished.
 
     Raises:
@@ -180,7 +180,7 @@ def measured(row: Row) -> Measured | None:
     if checks:
         last = checks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
-    return Measured(row.budget, row.config.train.seed, plan.took, figures)
+    return RunResult(row.budget, row.config.train.seed, plan.took, figures)
 
 
 def _has_metrics(run: Path) -> bool:

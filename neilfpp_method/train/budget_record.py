@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neilfpp_method.budget.plan import Costs, StageCost
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.plain import from_dict
-from neilfpp_method.train.json_files import is_finite_number, read_json, write_json
+from neilfpp_method.train.json_files import is_finite_number, read_json
 
 __all__ = ["FILE", "BudgetPlan", "Revision", "read_budget", "write_budget"]
 

@@ -25,7 +25,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import OrientedPoints
-from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.optimizer import Stream, seed_stream
 
 __all__ = [
     "build_model",
@@ -118,7 +118,7 @@ def initial_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> N
     Raises:
         UserError: see `build_model` and `show_known_light`.
     """
-    seed_step(config.train.seed, step=-1)
+    seed_stream(config.train.seed, Stream.WEIGHTS)
     model = build_model(capture, facts, config)
     show_known_light(model)
     return model

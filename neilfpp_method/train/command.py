@@ -18,7 +18,7 @@ from neilfpp_method.data.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import record_exposures, record_facts
-from neilfpp_method.effects.table import table
+from neilfpp_method.effects.table import effects_table
 from neilfpp_method.errors import Unsound
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.mesh import MeshHost
@@ -47,12 +47,12 @@ from neilfpp_method.train.loop import train
 from neilfpp_method.train.memory import check_training_memory
 from neilfpp_method.train.mesh_fit import measure_mesh_fit
 from neilfpp_method.train.opening import OpenRun, open_run, plan_run, training_rays
-from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.optimizer import Stream, seed_stream
 from neilfpp_method.train.pace import Pace
 from neilfpp_method.train.preview import write_preview
 from neilfpp_method.train.progress import Reporter, reporting
 from neilfpp_method.train.quality import Quality, has_checks
-from neilfpp_method.train.reading import load_pixels
+from neilfpp_method.train.reading import load_training_pixels
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import PIXELS, create_run
 from neilfpp_method.train.start import start_geometry
@@ -136,7 +136,7 @@ class _Prepared:
 
 def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
     """Read the pixels, build the model, and create the folder of a new run."""
-    pixels = load_pixels(run.capture, run.out / PIXELS, fabric, console)
+    pixels = load_training_pixels(run.capture, run.out / PIXELS, fabric, console)
     facts = _measure_facts(run, pixels) if run.facts is None else run.facts
     record_facts(run.plan, facts)
     config = run.plan.config_of_model
@@ -270,7 +270,7 @@ def _train(
 
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
-    seed_step(config.train.seed, step=-2)
+    seed_stream(config.train.seed, Stream.HEALTH)
     return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
 
 
@@ -294,7 +294,7 @@ def _finish(
     if training.fits:
         console.print(f"light: {light_summary(training.config.light, training.fits)}", soft_wrap=True)
     if training.plan.request.base != "as-set":
-        console.print(table(training.plan))
+        console.print(effects_table(training.plan))
     console.print(f"health: {training.watch.health}", soft_wrap=True, markup=False)
     if at_end is not None:
         at_end(run.out)

@@ -15,6 +15,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.plan import Decision, Plan
@@ -23,7 +24,7 @@ from neilfpp_method.effects.table import rows
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 
 __all__ = ["read_plan", "write_plan"]
 

@@ -28,7 +28,7 @@ from neilfpp_method.schedule import StagePosition, stage_at
 from neilfpp_method.structures import StepResult
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.light_record import note_fit
-from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.optimizer import Stream, seed_stream
 from neilfpp_method.train.training import Training
 
 __all__ = ["apply_plan", "observe_and_solve", "review_before_stage", "search_material"]
@@ -68,9 +68,9 @@ def _share_light(run: Training) -> None:
 def review_before_stage(run: Training, step: int) -> None:
     """Take the measurements before a stage that trains material."""
     if run.model.stages[stage_at(step, run.config.train).stage].moves_material:
-        _review_effects(run, step, review_surface, -3)
+        _review_effects(run, step, review_surface, Stream.SURFACE)
         _start_light(run, step)
-        _review_effects(run, step, review_material, -5)
+        _review_effects(run, step, review_material, Stream.MATERIAL)
 
 
 def _start_light(run: Training, step: int) -> None:
@@ -80,14 +80,13 @@ def _start_light(run: Training, step: int) -> None:
     model = run.model
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
-        seed_step(run.config.train.seed, -4 - step)
+        seed_stream(run.config.train.seed, Stream.LIGHT, step)
         review = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
         decisions, first = review.decisions, review.first
         _report(run, decisions)
         if first is not None:
             run.reporter.say(first.summary())
-            start_with(model, first)
-            evidence = run.light_solver.start(first.observed, first.material, model.scene, first.lamp_trial)
+            evidence = start_with(model, run.light_solver, first)
             note_fit(run.fits, evidence, model.lamps.count, step)
             _report(run, record_lamps(run.plan, evidence, model.lamps.count, step))
     _share_light(run)
@@ -104,7 +103,7 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
         return
     if run.fabric.is_global_zero:
         with timed("light_fits", apart=True):
-            seed_step(run.config.train.seed, -6 - step)
+            seed_stream(run.config.train.seed, Stream.SEARCH, step)
             summary = improve_material(model, light_places(model, run.pixels, most))
         if summary is not None:
             run.reporter.say(summary)
@@ -118,20 +117,20 @@ def _light_pixels(run: Training) -> int:
     return MAX_PIXELS if most is None else most
 
 
-def _review_effects(run: Training, step: int, review: Review, stream: int) -> None:
+def _review_effects(run: Training, step: int, review: Review, stream: Stream) -> None:
     """Decide open effects by evidence. The first process does this for all.
 
     Args:
         run: the training.
         step: number of steps trained so far.
         review: takes the measurements.
-        stream: selects the random numbers of these measurements, so that no training step uses the same.
+        stream: the random numbers of these measurements.
     """
     if not needs_surface(run.plan):
         return
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
-        seed_step(run.config.train.seed, stream - step)
+        seed_stream(run.config.train.seed, stream, step)
         decisions = review(run.plan, run.model, run.pixels, step)
         _report(run, decisions)
     _share_decisions(run, decisions)

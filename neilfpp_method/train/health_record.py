@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.health.cases import Finding
 from neilfpp_method.health.watch import FILE, FORMAT, Watch
-from neilfpp_method.train.json_files import read_entries, write_json
+from neilfpp_method.train.json_files import read_entries
 
 __all__ = ["read_findings", "write_findings"]
 

@@ -1,30 +1,18 @@
-"""Read and write JSON objects in a run folder."""
+"""Read the JSON objects of a run folder; `data.json_entry.write_json` writes them."""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import from_dict
 
-__all__ = ["is_finite_number", "read_entries", "read_json", "write_json"]
+__all__ = ["is_finite_number", "read_entries", "read_json"]
 
 Entry = TypeVar("Entry")
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Write a JSON object atomically.
-
-    Raises:
-        UserError: if the file cannot be written.
-    """
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.lighting.fit import MIN_POINTS, Evidence
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
-from neilfpp_method.train.json_files import read_entries, write_json
+from neilfpp_method.train.json_files import read_entries
 
 __all__ = ["LightFit", "light_summary", "note_fit", "read_fits", "write_fits"]
 

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
 from neilfpp_method.hosts.base import HasSurfaceWidth
@@ -41,7 +42,7 @@ from neilfpp_method.train.checkpoint import (
 from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.evidence import apply_plan, observe_and_solve, review_before_stage, search_material
 from neilfpp_method.train.health_record import read_findings, write_findings
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.light_record import read_fits, write_fits
 from neilfpp_method.train.optimizer import (
     gradient_norms,
@@ -153,7 +154,7 @@ def _check_quality(run: Training, position: StagePosition, step: int) -> None:
         run.quality.check_when_due(run.model, position, step, run.ledger.total)
 
 
-@timed("optimiser")
+@timed("optimizer")
 def _update(
     run: Training, optimizer: torch.optim.Optimizer, terms: LossTerms, total: Total, moment: Moment
 ) -> bool:

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from enum import IntEnum
 
 import torch
 from torch import Tensor
 
 from neilfpp_method.hosts.base import Host, LimitsSurfaceWidth, StartsFromShape
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, StagePosition, rate_factor, surface_width_limit
+from neilfpp_method.schedule import Stage, StagePosition, learning_rate, rate_factor, surface_width_limit
 from neilfpp_method.settings.types import OptimizerConfig, VolumeConfig
 
 __all__ = [
+    "Stream",
     "adam",
     "gradient_norms",
     "limit_surface_width",
     "make_optimizer",
     "seed_step",
+    "seed_stream",
     "set_rates",
     "waiting_fields",
 ]
@@ -32,7 +35,7 @@ def make_optimizer(model: NeilfModel, config: OptimizerConfig) -> torch.optim.Op
     Frozen parameters are included; they receive no gradient and are not changed.
     """
     groups = [
-        {"params": parameters, "name": name, "lr": getattr(config, name)}
+        {"params": parameters, "name": name, "lr": learning_rate(config, name)}
         for name, parameters in model.parameter_groups().items()
         if parameters
     ]
@@ -65,7 +68,7 @@ def set_rates(
     factor = rate_factor(config, position)
     for group in optimizer.param_groups:
         name = group["name"]
-        group["lr"] = 0.0 if name in waiting else getattr(config, name) * factor
+        group["lr"] = 0.0 if name in waiting else learning_rate(config, name) * factor
 
 
 def waiting_fields(model: NeilfModel, config: OptimizerConfig, position: StagePosition) -> set[str]:
@@ -106,6 +109,22 @@ def seed_step(seed: int, step: int, rank: int = 0) -> None:
     process. So a resumed run draws the same numbers as one that was never interrupted.
     """
     torch.manual_seed((seed * 1_000_003 + step) * 4_099 + rank)
+
+
+class Stream(IntEnum):
+    """Random numbers that are not drawn by training steps: for initial weights, and for measurements."""
+
+    WEIGHTS = 1
+    HEALTH = 2
+    SURFACE = 3
+    LIGHT = 4
+    MATERIAL = 5
+    SEARCH = 6
+
+
+def seed_stream(seed: int, stream: Stream, step: int = 0) -> None:
+    """Seed the random number generator for a measurement after `step` steps, apart from that of any step."""
+    seed_step(seed, -stream - step)
 
 
 def gradient_norms(model: NeilfModel) -> dict[str, Tensor]:

@@ -20,12 +20,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePosition
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.structures import PixelBatch
-from neilfpp_method.train.json_files import is_finite_number, read_entries, write_json
+from neilfpp_method.train.json_files import is_finite_number, read_entries
 
 __all__ = ["FILE", "Quality", "QualityCheck", "has_checks", "read_checks", "write_checks"]
 
@@ -112,10 +113,8 @@ class _Measured:
 
 @torch.no_grad()
 def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool, hdr: bool) -> _Measured:
-    mode = model.training
-    model.eval()
-    maps = model.maps(pixels.rays, with_material)
-    model.train(mode)
+    with model.evaluating():
+        maps = model.maps(pixels.rays, with_material)
     photograph = tone_map(pixels.color) if hdr else pixels.color
     physical = _psnr(tone_map(maps.rgb), photograph) if with_material else None
     return _Measured(_psnr(tone_map(maps.rgb_volume), photograph), physical)

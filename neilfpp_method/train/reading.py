@@ -13,11 +13,11 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.timing.ledger import timed
 
-__all__ = ["load_pixels"]
+__all__ = ["load_training_pixels"]
 
 
 @timed("data", apart=True)
-def load_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
+def load_training_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
     """Read the training pixels into a folder in the first process, and open them there in all processes.
 
     Raises:

@@ -29,6 +29,7 @@ from typing import Any, Literal, TypeVar
 import torch
 
 from neilfpp_method.data.capture import Capture, Normalization, load_capture
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
@@ -39,7 +40,7 @@ from neilfpp_method.settings.types import NeilfConfig, TrainConfig
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.checkpoint import FORMAT, LAST, checkpoint_path, load_checkpoint, load_weights
 from neilfpp_method.train.effects_record import read_plan
-from neilfpp_method.train.json_files import read_json, write_json
+from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.lock import LOCK
 from neilfpp_method.train.output import check_folder
 from neilfpp_method.train.provenance import provenance

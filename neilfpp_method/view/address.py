@@ -7,7 +7,7 @@ import socket
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["check_free", "is_local"]
+__all__ = ["check_address", "is_local"]
 
 
 def is_local(host: str) -> bool:
@@ -24,7 +24,7 @@ def is_local(host: str) -> bool:
         return False
 
 
-def check_free(host: str, port: int) -> None:
+def check_address(host: str, port: int) -> None:
     """Check that a page can be served at an address.
 
     Raises:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from neilfpp_method.view.address import check_free
+from neilfpp_method.view.address import check_address
 from neilfpp_method.view.command import check_viser
 
 __all__ = ["viewer_beside"]
@@ -39,7 +39,7 @@ def viewer_beside(
         UserError: viser is not installed, or the port is not free.
     """
     check_viser()
-    check_free(HOST, port)
+    check_address(HOST, port)
     words = ["view", str(run), "--follow", "--host", HOST, "--port", str(port), "--device", device]
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(

@@ -75,7 +75,7 @@ class Page:
 
 
 def open_page(subject: Subject | None, skies: Mapping[str, Sky], host: str, port: int, label: str) -> Page:
-    """Serve the page. The port must be free (`address.check_free`)."""
+    """Serve the page. The port must be free (`address.check_address`)."""
     # viser prints a box with an address that is not the one to open.
     rich.get_console().quiet = True
     server = _Local(host=host, port=port, label=label, verbose=False)

@@ -15,7 +15,7 @@ from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import load_run
-from neilfpp_method.view.address import check_free, is_local
+from neilfpp_method.view.address import check_address, is_local
 from neilfpp_method.view.subject import Subject, subject_of
 
 __all__ = ["ViewRequest", "view"]
@@ -60,7 +60,7 @@ def view(
     """
     check_resolution(request.resolution)
     check_viser()
-    check_free(request.host, request.port)
+    check_address(request.host, request.port)
     skies = _skies(request.env, request.env_layout)
     loaded = _checkpoint_time(request)
     subject = None if request.follow and loaded is None else _load(request)

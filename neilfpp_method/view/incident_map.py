@@ -15,7 +15,7 @@ from neilfpp_method.relight.surface import OFFSET
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
-__all__ = ["Point", "light_at", "light_picture", "point_under"]
+__all__ = ["SurfacePoint", "light_at", "light_picture", "point_under"]
 
 HEIGHT = 48
 """Number of rows of the image."""
@@ -28,7 +28,7 @@ BELOW = 44
 
 
 @dataclass(frozen=True)
-class Point:
+class SurfacePoint:
     """A point of the surface with its unit normal, scene frame, and its material if there is one."""
 
     position: Float[torch.Tensor, " 3"]
@@ -37,7 +37,9 @@ class Point:
 
 
 @torch.no_grad()
-def point_under(subject: Subject, origin: tuple[float, ...], direction: tuple[float, ...]) -> Point | None:
+def point_under(
+    subject: Subject, origin: tuple[float, ...], direction: tuple[float, ...]
+) -> SurfacePoint | None:
     """First hit of a ray in the scene frame; None if it misses the surface, or hits it from the inside."""
     if subject.surface is None:
         return None
@@ -46,11 +48,11 @@ def point_under(subject: Subject, origin: tuple[float, ...], direction: tuple[fl
     if not len(hits.rows) or not bool(hits.outside[0]):
         return None
     material = subject.run.model.materials(hits.position) if subject.run.has_material else None
-    return Point(hits.position[0], hits.normal[0], material)
+    return SurfacePoint(hits.position[0], hits.normal[0], material)
 
 
 @torch.no_grad()
-def light_at(subject: Subject, light: Lighting, point: Point) -> Float[np.ndarray, "H W 3"]:
+def light_at(subject: Subject, light: Lighting, point: SurfacePoint) -> Float[np.ndarray, "H W 3"]:
     """Incident linear radiance at a point, in the layout of `lat_long_directions`; 0 below the surface.
 
     The run's own light is evaluated by the model; any other light is path-traced.
@@ -66,7 +68,7 @@ def light_at(subject: Subject, light: Lighting, point: Point) -> Float[np.ndarra
 
 
 def _by_paths(
-    subject: Subject, light: Lighting, point: Point, directions: Float[torch.Tensor, "D 3"]
+    subject: Subject, light: Lighting, point: SurfacePoint, directions: Float[torch.Tensor, "D 3"]
 ) -> Float[torch.Tensor, "D 3"]:
     """Incident radiance from the surface or the sky, plus that of lamps in front of them."""
     scene = scene_of(subject, light)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-__all__ = ["Pace", "sizes"]
+__all__ = ["RenderSpeed", "sizes"]
 
 FIRST_IMAGE = 0.12
 """Seconds that the first image of a view may take, which gives about eight images per second while the camera
@@ -22,7 +22,7 @@ NEW_WEIGHT = 0.5
 
 
 @dataclass
-class Pace:
+class RenderSpeed:
     """Measured rendering speed by layer, rays per second."""
 
     speed: dict[str, float] = field(default_factory=dict)

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.evaluate.pictures import display, display_color
-from neilfpp_method.relight.cameras import rays_through, resized
+from neilfpp_method.relight.cameras import pixel_rays, resized
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths
 from neilfpp_method.relight.sequence import Sequence
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.view.pace import Pace, sizes
+from neilfpp_method.view.pace import RenderSpeed, sizes
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
-__all__ = ["Frame", "PictureRequest", "frames"]
+__all__ = ["PictureRequest", "ViewerFrame", "frames"]
 
 BOUNCES = 4
 """Largest number of surface vertices of a path."""
@@ -56,7 +56,7 @@ class PictureRequest:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ViewerFrame:
     """A rendered image, which may be smaller than the window.
 
     Attributes:
@@ -76,7 +76,7 @@ Shader = Callable[[RayBatch, Tensor], Tensor]
 """Maps rays and their pixel indices to RGB and opacity, (N, 4)."""
 
 
-def frames(request: PictureRequest, pace: Pace) -> Iterator[Frame | None]:
+def frames(request: PictureRequest, pace: RenderSpeed) -> Iterator[ViewerFrame | None]:
     """Yield successively finer images of a request, and None between batches, when rendering may stop.
 
     Args:
@@ -98,7 +98,7 @@ def frames(request: PictureRequest, pace: Pace) -> Iterator[Frame | None]:
 
 
 def _render(
-    request: PictureRequest, camera: Camera, shader: Shader, pace: Pace, jitter: int
+    request: PictureRequest, camera: Camera, shader: Shader, pace: RenderSpeed, jitter: int
 ) -> Iterator[Tensor | None]:
     """Yield None after each batch but the last, then the values of all pixels.
 
@@ -114,8 +114,7 @@ def _render(
     while start < len(pixels):
         rows = pixels[start : start + pace.batch(layer)]
         begun = time.perf_counter()
-        corner = torch.stack((rows % camera.width, rows // camera.width), -1)
-        rays, _ = rays_through(camera, corner + position)
+        rays = pixel_rays(camera, rows, position).rays
         # The copy to the CPU waits for the device, so that the measured time is that of the work.
         with torch.no_grad():
             done.append(shader(rays, rows).cpu())
@@ -175,7 +174,7 @@ def _opaque(color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
 
 def _frame(
     request: PictureRequest, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int
-) -> Frame:
+) -> ViewerFrame:
     """Convert RGB and opacity to an 8-bit image over the background."""
     shape = (camera.height, camera.width)
     alpha = values[:, 3:].clamp(0, 1)
@@ -188,7 +187,7 @@ def _frame(
         image = display(request.layer, straight)
     opacity = alpha.view(*shape, 1).numpy()
     image = np.rint(opacity * image + (1 - opacity) * 255 * PAPER).astype(np.uint8)
-    return Frame(image, _depth(request.subject, camera), share, samples)
+    return ViewerFrame(image, _depth(request.subject, camera), share, samples)
 
 
 def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:
@@ -196,7 +195,7 @@ def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:
     pixels = torch.arange(camera.width * camera.height, device=subject.device)
     depth = torch.full((len(pixels),), FAR, device=subject.device)
     if subject.surface is not None:
-        rays, _ = rays_through(camera, torch.stack((pixels % camera.width, pixels // camera.width), -1) + 0.5)
+        rays = pixel_rays(camera, pixels).rays
         hits = subject.surface.intersect(rays.origins, rays.directions)
         forward = torch.from_numpy(camera.w2c[2, :3].astype(np.float32)).to(subject.device)
         depth[hits.rows] = hits.distance * (rays.directions[hits.rows] @ forward)

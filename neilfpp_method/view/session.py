@@ -25,10 +25,10 @@ from neilfpp_method.relight.cameras import turntable
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.view.cameras import Pose, pinhole, pose_of
-from neilfpp_method.view.incident_map import Point, light_at, light_picture, point_under
-from neilfpp_method.view.pace import Pace
+from neilfpp_method.view.incident_map import SurfacePoint, light_at, light_picture, point_under
+from neilfpp_method.view.pace import RenderSpeed
 from neilfpp_method.view.painter import Painter
-from neilfpp_method.view.pictures import Frame, PictureRequest, frames
+from neilfpp_method.view.pictures import PictureRequest, ViewerFrame, frames
 from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
@@ -63,7 +63,7 @@ class Shared:
     """
 
     skies: Mapping[str, Sky]
-    pace: Pace = field(default_factory=Pace)
+    pace: RenderSpeed = field(default_factory=RenderSpeed)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
 
@@ -84,7 +84,7 @@ class Session:
         self.own = own_light(subject.run)
         self.lights = self._lights()
         self.moved: dict[int, np.ndarray] = {}
-        self.point: Point | None = None
+        self.point: SurfacePoint | None = None
         self.painter = Painter(
             lambda request: frames(request, shared.pace), self._show, self._failed, shared.lock
         )
@@ -192,7 +192,7 @@ class Session:
             )
         )
 
-    def _show(self, frame: Frame) -> None:
+    def _show(self, frame: ViewerFrame) -> None:
         self.client.scene.set_background_image(frame.image, format="jpeg", jpeg_quality=90, depth=frame.depth)
         parts = [f"{frame.image.shape[1]}×{frame.image.shape[0]}"]
         if frame.share < 1:

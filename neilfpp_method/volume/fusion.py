@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.volume.distance_grid import cell_size, look_up
 
-__all__ = ["FusedSurface", "fuse", "grid_normal", "mean_at"]
+__all__ = ["FusedSurface", "fuse_surface", "grid_normal", "mean_at"]
 
 WIDTH = 0.75
 """Standard deviation of a point's weight, in cells: it reaches the closest vertices and little beyond. It
@@ -44,7 +44,7 @@ class FusedSurface:
 
 
 @torch.no_grad()
-def fuse(
+def fuse_surface(
     position: Float[Tensor, "P 3"],
     normal: Float[Tensor, "P 3"],
     value: Float[Tensor, "P C"],

@@ -19,7 +19,7 @@ import torch
 import trimesh
 from scipy.ndimage import binary_erosion
 
-from benchmarks.blender import blender_picture, shown_psnr
+from benchmarks.blender import Shot, blender_picture, shown_psnr
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
@@ -76,7 +76,7 @@ def test_blender_agrees_with_the_path_tracer(python, tmp_path, source):
         pytest.importorskip("pxr")
     run = painted_run(tmp_path)
     write_ball(run, tmp_path / "asset", 512, faces=2000, resolution=128)
-    picture = blender_picture(python, tmp_path / "asset", VIEW, tmp_path / "out.exr", source, samples=128)
+    picture = blender_picture(python, tmp_path / "asset", Shot(VIEW, source), tmp_path / "out.exr")
     truth, within = own_picture(run)
     assert within.sum() > 150
     assert shown_psnr(picture, truth, within) > 33
@@ -90,11 +90,12 @@ def test_blender_agrees_with_the_path_tracer(python, tmp_path, source):
 def test_half_the_image_size(python, tmp_path):
     write_ball(painted_run(tmp_path), tmp_path / "asset", 64, faces=300)
     out = tmp_path / "out.exr"
-    assert blender_picture(python, tmp_path / "asset", VIEW, out, percent=50, samples=1).shape == (18, 24, 3)
+    shot = Shot(VIEW, percent=50, samples=1)
+    assert blender_picture(python, tmp_path / "asset", shot, out).shape == (18, 24, 3)
 
 
 def test_a_python_without_bpy_is_an_error(tmp_path):
     write_ball(painted_run(tmp_path), tmp_path / "asset", 64, faces=300)
     (tmp_path / "asset" / "bpy.py").write_text("raise ImportError('no bpy here')\n")
     with pytest.raises(UserError, match="pip install bpy"):
-        blender_picture(Path(sys.executable), tmp_path / "asset", VIEW, tmp_path / "out.exr")
+        blender_picture(Path(sys.executable), tmp_path / "asset", Shot(VIEW), tmp_path / "out.exr")

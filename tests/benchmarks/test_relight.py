@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import relight
-from benchmarks.mitsuba_scene import load_mitsuba, render
+from benchmarks.mitsuba_scene import LitScene, PathSampling, load_mitsuba, render
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.sky import Sky
@@ -25,9 +25,8 @@ def test_an_image_of_the_corner_agrees_with_mitsuba(tmp_path):
     camera = relight.corner_camera(12)
     scene = relight.scene_of(relight.corner_parts(), Sky(radiance, rows_at_poles=True, start=0.0))
     ours = render_picture(scene, camera, Budget(256), bounces=3).radiance.numpy()
-    theirs = render(
-        mi, relight.corner_parts(), radiance.numpy(), camera, tmp_path, samples=64, bounces=3, seed=1
-    )
+    lit = LitScene(relight.corner_parts(), radiance.numpy())
+    theirs = render(mi, lit, camera, PathSampling(64, bounces=3, seed=1), tmp_path)
     mean = theirs.mean()
     assert ours.mean() == pytest.approx(mean, rel=0.015)
     assert np.abs(ours - theirs).mean() < 0.1 * mean

@@ -66,11 +66,11 @@ def test_hessians_and_traced_light_agree():
     x = torch.randn(20, 3, dtype=torch.float64)
     one, other = (m.host.sdf_field.hessian(x, "analytic") for m in (model, plain))
     torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
-    settings, out = model.config.inter_reflection, normalize(x, dim=-1)
+    out = normalize(x, dim=-1)
     torch.manual_seed(0)
-    ours = trace_light(model.host, 1.5 * out, -out, settings, hit_share=0.8)
+    ours = trace_light(model.host, 1.5 * out, -out, model.config)
     torch.manual_seed(0)
-    theirs = trace_light(plain.host, 1.5 * out, -out, settings, hit_share=0.8)
+    theirs = trace_light(plain.host, 1.5 * out, -out, model.config)
     assert ours.hit.equal(theirs.hit)
     # The package adds no cuts to a converged ray: both opacities are accurate to ε, not to the
     # last digit.

@@ -18,7 +18,6 @@ from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS
-from neilfpp_method.evaluate.render_views import view_names
 from neilfpp_method.train.checkpoint import LAST, last_checkpoint
 from tests.data.make_capture import CENTER, RADIUS
 
@@ -137,5 +136,5 @@ def test_a_run_without_a_name_is_named_after_its_capture(capture, tmp_path, monk
 def test_a_group_without_views_is_refused(capture, group):
     loaded = load_capture(capture)
     chosen = frozenset() if group == "test" else frozenset(view.name for view in loaded.views)
-    with pytest.raises(UserError, match=f"there is no {group} view; give --views all"):
-        view_names(replace(loaded, test=chosen), group)
+    with pytest.raises(UserError, match=f"there is no {group} view; give all"):
+        replace(loaded, test=chosen).chosen_views([group])

@@ -15,6 +15,7 @@ from neilfpp_method.effects.metals import metals_evidence
 from neilfpp_method.effects.place_data import ROWS
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Material, Observed
@@ -118,6 +119,6 @@ def test_a_model_starts_with_the_estimated_map():
     places = ball(torch.ones(1, 3), torch.ones(1, 1), torch.zeros(1, 1), None)
     trial = LampTrial(data_of(places, LOBES["ggx"]).hold_back(0, 2), pytest.fail)
     found = FirstLight(sky().log_radiance, gray, {0.33: 0.1}, 0.33, COUNT, *unseen, trial)
-    start_with(model, found)
+    start_with(model, NothingToSolve(), found)
     coarse = model.light.at_most(ROWS).log_radiance
     assert (coarse - sky().log_radiance).abs().median() < 0.1

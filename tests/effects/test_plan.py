@@ -60,7 +60,7 @@ def test_self_visibility_is_the_cosine_weighted_share(share):
     model = sphere_model(solved_light(tiny_config()))
     model.host.scene_light = half_walls(share)
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(400, 3)
-    found = self_visibility(model, model.config.inter_reflection, up, up)
+    found = self_visibility(model, model.config, up, up)
     assert found.value == pytest.approx(share, abs=0.01)
     assert found.favours(chosen=False) is (share > 0)
 

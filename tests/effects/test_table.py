@@ -7,7 +7,7 @@ from rich.console import Console
 
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.request import parse_effects
-from neilfpp_method.effects.table import rows, table
+from neilfpp_method.effects.table import effects_table, rows
 from neilfpp_method.settings.presets import PRESETS, preset
 
 
@@ -17,7 +17,7 @@ def test_no_word_is_broken_at_80_columns(name, effects):
     plan = Plan.begin(parse_effects(effects), preset(name))
     console = Console(width=80, markup=False, highlight=False)
     with console.capture() as captured:
-        console.print(table(plan))
+        console.print(effects_table(plan))
     words = set(captured.get().split())
     for row in rows(plan):
         for column in ("effect", "decision", "reason", "cost", "risk"):
@@ -30,6 +30,6 @@ def test_a_long_file_name_is_shown_in_full():
     plan.decisions.append(Decision(0, "background", True, "files", name))
     console = Console(width=80, markup=False, highlight=False)
     with console.capture() as captured:
-        console.print(table(plan))
+        console.print(effects_table(plan))
     shown = "".join(line[29:46].strip() for line in captured.get().splitlines())
     assert name in shown

@@ -16,8 +16,8 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import confidence
 from neilfpp_method.evaluate.confidence import (
     MIN_NOISE,
-    gather_evidence,
     material_deviation,
+    measure_residuals,
     surface_at_pixels,
     with_deviation,
 )
@@ -65,8 +65,8 @@ def run(tmp_path_factory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def evidence(run: Run):
-    return gather_evidence(run)
+def residuals(run: Run):
+    return measure_residuals(run)
 
 
 def on_sphere(count: int) -> torch.Tensor:
@@ -117,51 +117,51 @@ def test_patches_add_up_to_all_light(run: Run):
 # -------------------------------------------------------------------------------------------------- deviation
 
 
-def test_the_result_does_not_depend_on_the_batches(run: Run, evidence, monkeypatch):
+def test_the_result_does_not_depend_on_the_batches(run: Run, residuals, monkeypatch):
     normal = on_sphere(40)
-    whole = material_deviation(run.model, evidence, SPHERE * normal, normal)
+    whole = material_deviation(run.model, residuals, SPHERE * normal, normal)
     monkeypatch.setattr(confidence, "POINTS_AT_ONCE", 7)
     monkeypatch.setattr(confidence, "SIGHTED_AT_ONCE", 16)
     shares: list[float] = []
-    parts = material_deviation(run.model, evidence, SPHERE * normal, normal, shares.append)
+    parts = material_deviation(run.model, residuals, SPHERE * normal, normal, shares.append)
     for f in fields(whole):
         torch.testing.assert_close(getattr(parts, f.name), getattr(whole, f.name), rtol=1e-3, atol=1e-4)
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
 
 
-def test_a_point_without_views_has_the_error_of_a_guess(run: Run, evidence):
+def test_a_point_without_views_has_the_error_of_a_guess(run: Run, residuals):
     normal = on_sphere(60)
     with torch.no_grad():
         material = run.model.materials(SPHERE * normal)
     prior = (1 / 12 + (material.base_color - 0.5).square().mean(-1, keepdim=True)).sqrt()
-    inside_out = material_deviation(run.model, evidence, SPHERE * normal, -normal)
+    inside_out = material_deviation(run.model, residuals, SPHERE * normal, -normal)
     torch.testing.assert_close(inside_out.base_color, prior, rtol=1e-2, atol=0.0)
-    outside = material_deviation(run.model, evidence, SPHERE * normal, normal)
-    seen = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).visible.any(1)
+    outside = material_deviation(run.model, residuals, SPHERE * normal, normal)
+    seen = residuals.views.sightings(run.model, SPHERE * normal, normal, 5).visible.any(1)
     # Points whose pixels are not explained also have the error of a guess.
     assert ((outside.base_color - prior)[seen].abs() > 1e-3).float().mean() > 0.5
     torch.testing.assert_close(outside.base_color[~seen], prior[~seen], rtol=1e-2, atol=0.0)
 
 
-def test_well_explained_images_lower_the_expected_error(run: Run, evidence):
+def test_well_explained_images_lower_the_expected_error(run: Run, residuals):
     normal = on_sphere(60)
-    hopeless = replace(evidence, noise=1e4, misfit=MIN_NOISE)
+    hopeless = replace(residuals, noise=1e4, misfit=MIN_NOISE)
     doubt = [
         material_deviation(run.model, believed, SPHERE * normal, normal).roughness.var().item()
-        for believed in (hopeless, replace(evidence, noise=0.05))
+        for believed in (hopeless, replace(residuals, noise=0.05))
     ]
     assert doubt[0] < 1e-6 < doubt[1]  # untrained: every point has the error of a guess
 
 
-def test_points_with_unexplained_pixels_have_larger_errors(run: Run, evidence):
+def test_points_with_unexplained_pixels_have_larger_errors(run: Run, residuals):
     normal = on_sphere(60)
-    looks = evidence.views.sightings(run.model, SPHERE * normal, normal, 5).visible.sum(1)
+    looks = residuals.views.sightings(run.model, SPHERE * normal, normal, 5).visible.sum(1)
     usual, off = (
-        material_deviation(run.model, replace(evidence, misfit=misfit), SPHERE * normal, normal).metallic[
+        material_deviation(run.model, replace(residuals, misfit=misfit), SPHERE * normal, normal).metallic[
             :, 0
         ]
-        for misfit in (100 * evidence.misfit, 10 * evidence.misfit)
+        for misfit in (100 * residuals.misfit, 10 * residuals.misfit)
     )
     assert torch.equal(usual[looks == 0], off[looks == 0])
     assert (off >= usual).all()
@@ -169,14 +169,14 @@ def test_points_with_unexplained_pixels_have_larger_errors(run: Run, evidence):
     assert (off > 1.0005 * usual)[looks > 0].float().mean() > 0.5
 
 
-def test_only_neighbors_are_smoothed(run: Run, evidence):
+def test_only_neighbors_are_smoothed(run: Run, residuals):
     apart = on_sphere(9)
     around = torch.nn.functional.normalize(
         apart[:1] + 0.01 * torch.randn(9, 3, generator=torch.Generator().manual_seed(0)), dim=-1
     )
     normal = torch.cat((around, apart[1:]))
-    alone = material_deviation(run.model, evidence, SPHERE * apart[1:], apart[1:]).roughness
-    found = material_deviation(run.model, evidence, SPHERE * normal, normal).roughness
+    alone = material_deviation(run.model, residuals, SPHERE * apart[1:], apart[1:]).roughness
+    found = material_deviation(run.model, residuals, SPHERE * normal, normal).roughness
     assert (found[:9] == found[0]).all()
     torch.testing.assert_close(found[9:], alone, rtol=1e-3, atol=1e-4)
     assert len(found[9:].unique()) > 1
@@ -190,22 +190,22 @@ def test_a_run_that_shows_no_surface_has_noise_as_large_as_its_pixels(run: Run):
 
     run = make_run(run.capture)
     run.model.host = Nothing()
-    evidence = gather_evidence(run)
-    assert (evidence.noise, evidence.misfit) == (1.0, 1.0)
-    assert not evidence.typical.any()
+    residuals = measure_residuals(run)
+    assert (residuals.noise, residuals.misfit) == (1.0, 1.0)
+    assert not residuals.typical.any()
 
 
-def test_an_empty_batch_of_points(run: Run, evidence):
-    assert len(material_deviation(run.model, evidence, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
+def test_an_empty_batch_of_points(run: Run, residuals):
+    assert len(material_deviation(run.model, residuals, torch.zeros(0, 3), torch.zeros(0, 3))) == 0
 
 
 # ------------------------------------------------------------------------------------------- maps and figures
 
 
-def test_maps_cover_the_surface_and_a_step_repeats_pixels(run: Run, evidence):
+def test_maps_cover_the_surface_and_a_step_repeats_pixels(run: Run, residuals):
     view = render_test_views(run)[0]
     hit = view.maps["opacity"][..., 0] > 0.5
-    coarse = with_deviation(run, evidence, view, step=4)
+    coarse = with_deviation(run, residuals, view, step=4)
     for name in ("base_color_std", "roughness_std", "metallic_std"):
         values = coarse.maps[name]
         assert values.shape == (*hit.shape, 1)
@@ -241,10 +241,10 @@ def test_the_ratio_compares_the_half_with_smaller_expected_errors():
 
 
 def test_a_render_with_confidence_completes_one_without(run: Run, tmp_path: Path):
-    path = render_run(run, tmp_path, "test")[0]
+    path = render_run(run, tmp_path, ("test",))[0]
     picture = tmp_path / "metallic_std" / f"{path.stem}.png"
     assert not picture.exists()
-    render_run(run, tmp_path, "test", confidence=True)
+    render_run(run, tmp_path, ("test",), confidence=True)
     assert picture.exists()
     with pytest.raises(UserError, match="no material"):
-        render_run(replace(run, step=0), tmp_path, "test", confidence=True)
+        render_run(replace(run, step=0), tmp_path, ("test",), confidence=True)

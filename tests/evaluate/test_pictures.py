@@ -8,7 +8,7 @@ import pytest
 from neilfpp_method.evaluate.pictures import (
     PAPER,
     Group,
-    Row,
+    PictureRow,
     Section,
     auto_exposure,
     contact_sheet,
@@ -114,7 +114,7 @@ def test_directional_light_peaks_in_its_pixel(row: int, column: int):
 
 def sheet(value: int, rows: int = 2) -> np.ndarray:
     picture = np.full((30, 40, 3), value, dtype=np.uint8)
-    row = Row("base colour", (picture, picture[..., :1], None), "as estimated", "0.2")
+    row = PictureRow("base colour", (picture, picture[..., :1], None), "as estimated", "0.2")
     return contact_sheet(
         "a run", "fast", [Section((Group("view 004", ("truth", "estimate", "error")),), rows * (row,))], 160
     )

@@ -19,7 +19,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.panels import albedo_scale, view_sections
 from neilfpp_method.evaluate.pictures import display
-from neilfpp_method.evaluate.render_views import render_run, view_names
+from neilfpp_method.evaluate.render_views import render_run
 from neilfpp_method.evaluate.sheet import write_contact_sheet, write_light_picture
 from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_test_views, render_view
 from neilfpp_method.fields.lamps import Lamps
@@ -199,7 +199,7 @@ def test_the_light_picture_is_written_separately(root: Path, tmp_path: Path):
 def test_rendered_files_hold_the_values_and_rendering_continues(root: Path, tmp_path: Path):
     run = make_run(root)
     shares: list[float] = []
-    written = render_run(run, tmp_path, "test", on_progress=shares.append)
+    written = render_run(run, tmp_path, ("test",), on_progress=shares.append)
     assert [path.name for path in written] == ["000.exr", "002.exr"]
     assert shares[-1] == 1.0
     assert shares == sorted(shares)
@@ -214,7 +214,7 @@ def test_rendered_files_hold_the_values_and_rendering_continues(root: Path, tmp_
 
     (tmp_path / "000.exr").unlink()
     kept = (tmp_path / "002.exr").stat().st_mtime_ns
-    render_run(run, tmp_path, "test")
+    render_run(run, tmp_path, ("test",))
     assert (tmp_path / "000.exr").is_file()
     assert (tmp_path / "002.exr").stat().st_mtime_ns == kept
     render_run(run, tmp_path, ["002"], overwrite=True)
@@ -223,8 +223,12 @@ def test_rendered_files_hold_the_values_and_rendering_continues(root: Path, tmp_
 
 def test_views_are_selected_by_group_or_by_name(root: Path):
     capture = load_capture(root)
-    assert view_names(capture, "train") == {"001", "003"}
-    assert view_names(capture, "all") == {"000", "001", "002", "003"}
-    assert view_names(capture, "003") == {"003"}
+
+    def names(*words: str) -> list[str]:
+        return [view.name for view in capture.chosen_views(words)]
+
+    assert names("train") == ["001", "003"]
+    assert names("all") == ["000", "001", "002", "003"]
+    assert names("003", "test", "000") == ["000", "002", "003"]
     with pytest.raises(UserError, match="no view '9'"):
-        view_names(capture, ["000", "9"])
+        names("000", "9")

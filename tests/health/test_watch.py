@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.cli import main
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.measure import measure_surface
 from neilfpp_method.health.watch import Watch
@@ -16,7 +17,6 @@ from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.structures import PixelBatch, SurfaceHits
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.health_record import read_findings, write_findings
-from neilfpp_method.train.json_files import write_json
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 

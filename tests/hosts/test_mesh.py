@@ -226,6 +226,12 @@ def two_planes() -> trimesh.Trimesh:
     return trimesh.Trimesh(corners + ceiling, [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]], process=False)
 
 
+def with_rays_per_point(count: float) -> NeilfConfig:
+    return mesh_config(
+        inter_reflection=dataclasses.replace(mesh_config().inter_reflection, rays_per_point=count)
+    )
+
+
 def test_light_between_two_planes_is_their_emission():
     """The ceiling emits 1 + x, the floor 3 + y; a ray from the floor's centre hits the ceiling at a distance
     0.5 tan θ from the axis.
@@ -235,9 +241,8 @@ def test_light_between_two_planes_is_their_emission():
         n[:, 2:] < 0, 1.0 + x[:, :1], 3.0 + x[:, 1:2]
     ).expand(-1, 3)
     floor, up = torch.zeros(4000, 3), torch.tensor([[0.0, 0.0, 1.0]]).expand(4000, 3)
-    settings = dataclasses.replace(mesh_config().inter_reflection, rays_per_point=1.0)
     torch.manual_seed(0)
-    traced = trace_light(host, floor, up, settings, 0.8)
+    traced = trace_light(host, floor, up, with_rays_per_point(1.0))
     across = 0.5 * traced.wi[:, :2] / traced.wi[:, 2:]
     torch.testing.assert_close(traced.hit, (across.abs() < 0.5).all(-1))
     expected = (1.0 + across[traced.hit][:, :1]).expand(-1, 3)
@@ -248,7 +253,7 @@ def test_light_between_two_planes_is_their_emission():
         host, mesh_config(loss=dataclasses.replace(mesh_config().loss, unit="activation")), FACTS
     )
     model.light.radiance = lambda x, wi: torch.ones_like(wi)
-    model.config = dataclasses.replace(model.config, inter_reflection=settings)
+    model.config = with_rays_per_point(1.0)
     torch.manual_seed(0)
     term = model._inter_reflection(floor, up)
     torch.testing.assert_close(term.mean(), across[traced.hit][:, 0].abs().mean())
@@ -281,15 +286,14 @@ FACTS = SceneFacts("linear", 0.2, 3.0, "constant")
 def test_rays_leave_a_surface_at_every_angle_without_hitting_it():
     torch.manual_seed(0)
     hits = mesh_host(SPHERE).render(rays_at(500, 0.4))
-    settings = dataclasses.replace(mesh_config().inter_reflection, rays_per_point=4.0)
-    assert not trace_light(mesh_host(SPHERE), hits.position, hits.normal, settings, 0.8).hit.any()
+    settings = with_rays_per_point(4.0)
+    assert not trace_light(mesh_host(SPHERE), hits.position, hits.normal, settings).hit.any()
 
 
 # --------------------------------------------------------------------------------------------------- training
 
 
 def test_r_material_and_light_are_trained_and_the_mesh_is_not():
-    assert mesh_config().inter_reflection.radiance_gradient == 0.7  # METHOD §2, for fixed geometry
     host = mesh_host(SPHERE)
     model = NeilfModel(
         host, mesh_config(loss=dataclasses.replace(mesh_config().loss, lambertian=1e-3)), FACTS

@@ -110,23 +110,21 @@ def test_traced_rays_that_hit_nothing_are_not_rendered(monkeypatch):
     skipping.density.above_floor.data.fill_(2e-3)
     plain.density.above_floor.data.fill_(2e-3)
     out = torch.nn.functional.normalize(torch.randn(200, 3), dim=-1)
-    settings = tiny_config().inter_reflection
+    settings = tiny_config()
     monkeypatch.setattr(traced, "MAX_ANGLE_DEG", 60.0)
-    above = trace_light(skipping, 0.6 * out, out, settings, hit_share=0.8)
+    above = trace_light(skipping, 0.6 * out, out, settings)
     assert len(above.hit) < 20
     monkeypatch.setattr(traced, "MAX_ANGLE_DEG", 20.0)
     torch.manual_seed(1)
-    towards = trace_light(skipping, 1.2 * out, -out, settings, hit_share=0.8)
+    towards = trace_light(skipping, 1.2 * out, -out, settings)
     torch.manual_seed(1)
-    all_of_them = trace_light(plain, 1.2 * out, -out, settings, hit_share=0.8)
+    all_of_them = trace_light(plain, 1.2 * out, -out, settings)
     assert len(towards.hit) == len(all_of_them.hit)
     assert abs(towards.hit.float().mean() - all_of_them.hit.float().mean()) < 0.05
 
 
 def test_no_ray_to_render_is_no_error():
-    none = trace_light(
-        host().train(), torch.zeros(0, 3), torch.zeros(0, 3), tiny_config().inter_reflection, hit_share=0.8
-    )
+    none = trace_light(host().train(), torch.zeros(0, 3), torch.zeros(0, 3), tiny_config())
     assert none.hit.shape == (0,)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.lighting import replay
-from neilfpp_method.lighting.replay import Replay
+from neilfpp_method.lighting.replay import PointReplay
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import SurfacePixels
@@ -66,7 +66,7 @@ def test_points_of_a_borrowed_host_are_not_replayed():
 def test_replayed_points_keep_their_pixels():
     """All values of a point are derived from one number, which identifies it."""
     torch.manual_seed(0)
-    memory = Replay(0.25, 40)
+    memory = PointReplay(0.25, 40)
 
     def numbered(values: torch.Tensor) -> SurfacePixels:
         column = values[:, None].expand(-1, 3)

@@ -296,7 +296,7 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--views", "turntable", "--frames", "1"], ("1 frames",)),
         (["--width", "100000"], ("100000×75000",)),
         (["--views", "turntable", "--truth", "x"], ("true images",)),
-        (["--views", "nobody"], ("--views nobody", "no view of this name", "000")),
+        (["--views", "nobody"], ("no view 'nobody'", "000")),
         (["--views", "turntable", "000"], ("--views turntable",)),
         (["--checkpoint", "sdf_init"], ("no material",)),
         (

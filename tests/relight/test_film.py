@@ -49,13 +49,12 @@ def test_alpha_is_the_share_of_a_pixel_that_is_covered(scene):
     assert picture.normal[size // 2, size // 2, 2] > 0.95
 
 
-def test_the_time_limit_ends_an_image(scene):
+def test_the_time_limit_ends_an_image(scene, monkeypatch):
     ticks = iter(range(10_000))
+    monkeypatch.setattr("neilfpp_method.relight.film.monotonic", lambda: float(next(ticks)))
     shares: list[float] = []
     budget = Budget(None, seconds=10.0)
-    picture = render_picture(
-        scene, camera(64, 64), budget, 1, 0, shares.append, clock=lambda: float(next(ticks))
-    )
+    picture = render_picture(scene, camera(64, 64), budget, 1, 0, shares.append)
     assert 1 <= picture.samples < 200
     assert shares == sorted(shares)
     assert shares[-1] == pytest.approx(1, abs=0.2)

@@ -59,11 +59,11 @@ def test_density_of_directions_that_hit_a_lamp():
     x = torch.zeros(5000, 3)
     drawn = pair.sample(x, u)
     for lamp in (0, 1):
-        distance, radiance = pair.intersect(x, drawn.wi, lamp)
-        mine = (distance == drawn.distance) & distance.isfinite()
+        met = pair.intersect(x, drawn.wi, lamp)
+        mine = (met.distance == drawn.distance) & met.distance.isfinite()
         assert mine.sum() > 10
         assert torch.allclose(pair.pdf(x, lamp)[mine], drawn.pdf[mine], rtol=1e-4)
-        assert (radiance[mine] == 1).all()
+        assert (met.radiance[mine] == 1).all()
     # Their shares, each spread over the solid angle of its lamp, add up to 1.
     total = sum(
         pair.pdf(x[:1], k).item() * 2 * math.pi * (1 - c) for k, c in ((0, 0.96**0.5), (1, 0.9975**0.5))

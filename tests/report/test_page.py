@@ -17,7 +17,7 @@ import pytest
 
 from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.glossary import explain
+from neilfpp_method.evaluate.glossary import style_of
 from neilfpp_method.report.files import changed_settings, read_files
 from neilfpp_method.report.markup import Html, data_block, element
 from neilfpp_method.report.write import ReportOptions, write_report
@@ -143,9 +143,9 @@ def test_measured_figures_replace_those_of_the_shown_views(run: Path):
     (run / "metrics-protocol.json").write_text(json.dumps({"mask_source": "true depth"}))
     text = page_of(run).text
     for name, value in figures.items():
-        entry = explain(name.removesuffix("_frame"))
-        assert entry.format(value) in text
-        assert entry.meaning in text
+        style = style_of(name.removesuffix("_frame"))
+        assert style.format(value) in text
+        assert style.meaning in text
     assert "mask source: true depth" in text
     assert "older than the checkpoint" not in text
     os.utime(run / "metrics.json", (0, 0))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
 
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.schedule import Stage, active_losses, stage_steps, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.structures import OrientedPoints
@@ -71,3 +72,20 @@ def test_a_larger_preset_differs_only_in_sizes_and_steps(smaller, larger):
     assert all(type(before[path]) is int and before[path] < after[path] for path in changed)
     stages = ("sdf_steps", "material_steps", "joint_steps")
     assert {f"train.{name}" for name in (*stages, "rays")} <= changed
+
+
+@pytest.mark.parametrize("name", ["fast", "balanced", "best"])
+def test_the_page_on_budgets_has_the_sizes_of_the_presets(name):
+    page = Path(__file__).parents[2] / "docs" / "budget.md"
+    rows = [line.strip("| ").split(" | ") for line in page.read_text(encoding="utf-8").splitlines()]
+    (row,) = [row for row in rows if row[0] == f"`{name}`"]
+    config = preset(name)
+    steps = tuple(stage_steps(config.train).values())
+    rays = sum(steps) * config.train.rays / 1e6
+    assert row[1:6] == [
+        ", ".join(map(str, steps)),
+        str(config.train.rays),
+        str(config.shading.train_samples),
+        str(config.encoding.max_resolution),
+        f"{rays:.1f} million" if rays < 10 else f"{rays:.0f} million",
+    ]

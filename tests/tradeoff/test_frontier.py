@@ -11,16 +11,16 @@ import re
 
 import pytest
 
-from neilfpp_method.tradeoff.command import table
+from neilfpp_method.tradeoff.command import frontier_table
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.files import write_tradeoff
-from neilfpp_method.tradeoff.frontier import Measured, frontier
+from neilfpp_method.tradeoff.frontier import RunResult, frontier
 
 
-def runs_of(*figures: tuple[float, float, float], seed: int = 0) -> list[Measured]:
+def runs_of(*figures: tuple[float, float, float], seed: int = 0) -> list[RunResult]:
     """Runs of one seed: seconds, dB of base colour, degrees of normals."""
     return [
-        Measured(seconds, seed, seconds, {"base_color_psnr_scaled": decibels, "normal_mae_deg": degrees})
+        RunResult(seconds, seed, seconds, {"base_color_psnr_scaled": decibels, "normal_mae_deg": degrees})
         for seconds, decibels, degrees in figures
     ]
 
@@ -51,7 +51,10 @@ def test_seeds_have_a_mean_and_a_deviation():
 
 
 def test_only_figures_that_all_runs_have_are_compared():
-    runs = [Measured(60.0, 0, 60.0, {"held_back_psnr": 20.0, "pbr_psnr": 1.0}), *runs_of((120.0, 20.0, 10.0))]
+    runs = [
+        RunResult(60.0, 0, 60.0, {"held_back_psnr": 20.0, "pbr_psnr": 1.0}),
+        *runs_of((120.0, 20.0, 10.0)),
+    ]
     assert frontier(runs)[0].figures == {}
     assert not any(point.dominated for point in frontier(runs))
     assert frontier([]) == []
@@ -72,8 +75,8 @@ def test_the_files_agree(tmp_path):
     assert "a &lt;scene&gt;" in drawn
     for label in ("1m: 20.00", "2m: 19.00", "1m: 10.00", "2m: 10.00"):
         assert label in drawn  # every point has its label
-    assert "2m" in "".join(table(frontier(runs)))
-    assert sum("dominated" in line for line in table(frontier(runs))) == 1
+    assert "2m" in "".join(frontier_table(frontier(runs)))
+    assert sum("dominated" in line for line in frontier_table(frontier(runs))) == 1
 
 
 def test_better_is_higher_and_later_is_further_right():

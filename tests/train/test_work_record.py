@@ -7,10 +7,10 @@ import time
 import pytest
 from rich.console import Console
 
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.timing.ledger import WORK
 from neilfpp_method.train.command import run_training
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.work_record import FILE, read_work
 from tests.data.make_capture import make_capture

@@ -12,7 +12,7 @@ import pytest
 
 from neilfpp_method.cli import main
 from neilfpp_method.train.checkpoint import last_checkpoint
-from neilfpp_method.view.address import check_free
+from neilfpp_method.view.address import check_address
 from neilfpp_method.view.beside import viewer_beside
 
 pytest.importorskip("viser")
@@ -35,7 +35,7 @@ def test_the_page_is_served_while_the_context_runs(tmp_path, port):
             time.sleep(0.2)
     assert len(said) == 1
     assert f"http://127.0.0.1:{port}" in said[0]
-    check_free("127.0.0.1", port)
+    check_address("127.0.0.1", port)
 
 
 def test_a_failed_viewer_is_reported_and_does_not_affect_the_training(found, tmp_path, port):

@@ -16,7 +16,7 @@ from neilfpp_method.cli import main
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.view import command
-from neilfpp_method.view.address import check_free
+from neilfpp_method.view.address import check_address
 
 
 def request(run: Path, port: int, **changes) -> command.ViewRequest:
@@ -52,7 +52,7 @@ def test_the_page_is_served_until_it_is_ended(found, port):
     command.view(request(found, port), said.append, once)
     assert served == [200]
     assert said == [f"open http://127.0.0.1:{port} in a browser; press Ctrl-C to stop"]
-    check_free("127.0.0.1", port)  # the port is free again
+    check_address("127.0.0.1", port)  # the port is free again
 
 
 def test_following_waits_and_shows_each_new_checkpoint(found, port, tmp_path, monkeypatch):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neilfpp_method.view.pace import BATCH, FIRST_IMAGE, Pace, sizes
+from neilfpp_method.view.pace import BATCH, FIRST_IMAGE, RenderSpeed, sizes
 
 
 def test_sizes_double_up_to_the_whole_window():
@@ -20,7 +20,7 @@ def test_the_first_image_is_small_enough_to_appear_immediately():
 
 
 def test_the_number_of_rays_follows_the_measured_speed():
-    pace = Pace()
+    pace = RenderSpeed()
     pace.note("normal", 100_000, 1.0)
     assert pace.first_image("normal") == int(100_000 * FIRST_IMAGE)
     pace.note("normal", 300_000, 1.0)  # the mean of both: 200,000 per second

@@ -14,8 +14,8 @@ from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.incident_map import light_at, light_picture, point_under
-from neilfpp_method.view.pace import Pace
-from neilfpp_method.view.pictures import BOUNCES, FAR, Frame, PictureRequest, frames
+from neilfpp_method.view.pace import RenderSpeed
+from neilfpp_method.view.pictures import BOUNCES, FAR, PictureRequest, ViewerFrame, frames
 from neilfpp_method.view.subject import Lighting, own_light, scene_of, subject_of
 
 
@@ -29,9 +29,9 @@ def camera(subject):
     return turntable(subject.run.capture, 2, None, 40)[0].camera
 
 
-def pictures(wish: PictureRequest, count: int = 99) -> list[Frame]:
+def pictures(wish: PictureRequest, count: int = 99) -> list[ViewerFrame]:
     made = []
-    for frame in frames(wish, Pace({wish.layer: 2_000.0})):
+    for frame in frames(wish, RenderSpeed({wish.layer: 2_000.0})):
         if frame is not None:
             made.append(frame)
         if len(made) == count:

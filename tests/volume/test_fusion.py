@@ -6,14 +6,14 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.volume.distance_grid import cell_size, look_up, trace_grid
-from neilfpp_method.volume.fusion import fuse, grid_normal, mean_at
+from neilfpp_method.volume.fusion import fuse_surface, grid_normal, mean_at
 
 R, CELLS, BALL = 1.0, 48, 0.6
 
 
 def sphere(count: int = 20_000):
     normal = normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    return fuse(BALL * normal, normal, normal.abs(), R, CELLS), normal
+    return fuse_surface(BALL * normal, normal, normal.abs(), R, CELLS), normal
 
 
 def test_distances_are_accurate_near_the_surface_and_lower_bounds_elsewhere():
@@ -46,8 +46,8 @@ def test_rays_hit_the_fused_surface():
 
 
 def test_no_points_give_an_empty_grid():
-    nothing = fuse(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3), R, 8)
+    nothing = fuse_surface(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, 3), R, 8)
     assert (nothing.distance > 0).all()
     assert not trace_grid(nothing.distance, R, torch.zeros(1, 3), torch.eye(3)[:1]).hit.any()
-    outside = fuse(torch.full((4, 3), 5.0), torch.eye(3)[[0, 1, 2, 0]], torch.zeros(4, 3), R, 8)
+    outside = fuse_surface(torch.full((4, 3), 5.0), torch.eye(3)[[0, 1, 2, 0]], torch.zeros(4, 3), R, 8)
     assert torch.equal(outside.distance, nothing.distance)

@@ -43,7 +43,7 @@ from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.export.mesh import has_surface, surface_mesh
 from neilfpp_method.train.run import Run
 
-__all__ = ["DTU", "Observed", "chamfer_of_scan"]
+__all__ = ["DTU", "ScanData", "chamfer_of_scan"]
 
 NAME = "dtu"
 RESOLUTION = 512
@@ -63,7 +63,7 @@ LARGEST_CLOUD = 2**31
 
 
 @dataclass(frozen=True)
-class Observed:
+class ScanData:
     """The scanner's data of one scan.
 
     Attributes:
@@ -84,7 +84,7 @@ class Observed:
 
 
 def chamfer_of_scan(
-    vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"], scan: Observed
+    vertices: Float[np.ndarray, "V 3"], faces: Integer[np.ndarray, "F 3"], scan: ScanData
 ) -> dict[str, float]:
     """Compute the distances from the estimate to the truth, from the truth to the estimate, and their mean.
 
@@ -125,7 +125,7 @@ def chamfer_of_scan(
     }
 
 
-def read_scan(capture: Capture) -> Observed:
+def read_scan(capture: Capture) -> ScanData:
     """Read the scanner's data for the scan of a capture.
 
     Raises:
@@ -138,7 +138,7 @@ def read_scan(capture: Capture) -> Observed:
     shapes_fit = box.shape == (2, 3) and cell.shape == (1,) and plane.shape == (4,)
     if not shapes_fit or not np.isfinite([*box.flat, *cell, *plane]).all() or cell[0] <= 0:
         raise UserError(f"{mask_file}: not an observation mask of DTU", "download the SampleSet again")
-    return Observed(mask["ObsMask"], box[0], box[1], float(cell[0]), plane, _points(cloud_file))
+    return ScanData(mask["ObsMask"], box[0], box[1], float(cell[0]), plane, _points(cloud_file))
 
 
 def _files(capture: Capture) -> tuple[Path, Path, Path]:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.size import measured_views
 from neilfpp_method.evaluate.views import RenderedView
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.run import Run
 
 __all__ = ["Protocol", "decibels", "missing", "no_surface", "require_material", "write_figures"]

@@ -42,7 +42,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.metrics import align_scale
 from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
 from neilfpp_method.evaluate.published.similarity import ssim_map
-from neilfpp_method.evaluate.published.truth_files import existing, read_map
+from neilfpp_method.evaluate.published.truth_files import existing, read_array
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 from neilfpp_method.train.run import Run
@@ -187,10 +187,10 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
         rotation = GL_FROM_CV @ view.camera.w2c[:3, :3]
         if path := _ground_truth(capture, "surface_normal", f"{view.image.stem}.npy"):
             normal = (estimate.maps["normal"] * opacity) @ rotation.T
-            figures["normal_distance"] = normal_distance(normal, _quarter(read_map(path, (*full, 3))), mask)
+            figures["normal_distance"] = normal_distance(normal, _quarter(read_array(path, (*full, 3))), mask)
         if path := _ground_truth(capture, "z_depth", f"{view.image.stem}.npy"):
             depth = _along_axis(capture, view, estimate)
-            depths.append((depth, _quarter(read_map(path, full)), eroded(mask)))
+            depths.append((depth, _quarter(read_array(path, full)), eroded(mask)))
         for name, value in figures.items():
             scores.setdefault(name, []).append(value)
     means = {name: float(np.mean(values)) for name, values in scores.items()}

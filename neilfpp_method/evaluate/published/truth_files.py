@@ -12,7 +12,7 @@ from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.views import View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["alpha_of", "check_full_size", "existing", "read_beside", "read_map"]
+__all__ = ["alpha_of", "check_full_size", "existing", "read_array", "read_beside"]
 
 
 def check_full_size(protocol: str, view: View) -> None:
@@ -60,7 +60,7 @@ def alpha_of(image: ImageFile) -> Float[np.ndarray, "H W 1"]:
     return alpha[..., None]
 
 
-def read_map(path: Path, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
+def read_array(path: Path, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
     """Read an array of numbers with a given shape from a `.npy` file.
 
     Raises:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from neilfpp_method.data.ply import needs_double
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.asset.surface import Surface
+from neilfpp_method.export.asset.surface import AssetSurface
 
 __all__ = ["Unwrapped", "unwrap"]
 
@@ -52,7 +52,7 @@ class Unwrapped:
         return (self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2
 
 
-def unwrap(surface: Surface, size: int) -> Unwrapped:
+def unwrap(surface: AssetSurface, size: int) -> Unwrapped:
     """Unwrap the triangles without overlap onto a texture of size × size texels.
 
     Raises:

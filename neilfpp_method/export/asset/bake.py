@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float, UInt8
 
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.export.asset.surface import Surface, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, first_hits, meet_along
 from neilfpp_method.export.asset.tangents import vertex_tangents
 from neilfpp_method.export.asset.texels import covered_texels, dilate
 from neilfpp_method.export.mesh import materials_in_parts
 from neilfpp_method.shading.color import tone_map
 from neilfpp_method.train.run import Run
 
-__all__ = ["Textures", "bake"]
+__all__ = ["Detail", "Textures", "bake"]
 
 CHANNELS = {
     "base_color": slice(0, 3),
@@ -54,12 +54,19 @@ class Textures:
         return np.concatenate([np.full_like(self.roughness, 255), self.roughness, self.metallic], axis=-1)
 
 
+@dataclass(frozen=True)
+class Detail:
+    """What the textures show: the fine surface, and its largest distance from the coarse one, scene units."""
+
+    surface: AssetSurface
+    reach: float
+
+
 @torch.no_grad()
 def bake(
     run: Run,
     mesh: Unwrapped,
-    fine: Surface,
-    reach: float,
+    detail: Detail,
     size: int,
     deviation: Float[np.ndarray, "V 3"] | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
@@ -67,19 +74,18 @@ def bake(
     """Evaluate the material and the normal of a run at every texel.
 
     The point of a texel on the coarse surface is moved along the normal onto the fine surface, if that is
-    within `reach`. Material and normal are taken at the moved point.
+    within reach. Material and normal are taken at the moved point.
 
     Args:
         run: the run.
         mesh: the coarse surface, unwrapped.
-        fine: the fine surface of the run.
-        reach: largest distance between both surfaces, scene units.
+        detail: the fine surface of the run, and its reach.
         size: width and height of the textures.
         deviation: expected errors at the vertices of `mesh`; None for no such texture.
         on_progress: called with the fraction of the work that is done.
     """
     device = next(run.model.parameters()).device
-    tracer, tangents = first_hits(fine), vertex_tangents(mesh)
+    tracer, tangents = first_hits(detail.surface), vertex_tangents(mesh)
     texture = np.zeros((size * size, 8 if deviation is None else 11), np.uint8)
     covered = np.zeros(size * size, bool)
     for texels in covered_texels(mesh, size):
@@ -88,7 +94,7 @@ def bake(
         tangent = texels.interpolate(tangents[:, :3], mesh.faces)
         sign = tangents[mesh.faces[texels.face, 0], 3:]
         unit_normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-12)
-        hits = meet_along(fine, tracer, position, unit_normal, reach)
+        hits = meet_along(detail.surface, tracer, position, unit_normal, detail.reach)
         points = torch.as_tensor(hits.position, dtype=torch.float32, device=device)
         material = materials_in_parts(run, points)
         values = [

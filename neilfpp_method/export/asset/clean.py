@@ -7,7 +7,7 @@ import trimesh
 from jaxtyping import Bool, Int
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.asset.surface import Surface, creased
+from neilfpp_method.export.asset.surface import AssetSurface, creased
 
 __all__ = ["HOLE", "clean", "close_holes", "keep_visible", "remove_small_components"]
 
@@ -17,7 +17,7 @@ MIN_COMPONENT = 0.002
 """A component whose area is a smaller fraction of that of the largest component is removed."""
 
 
-def clean(surface: Surface, visible: Bool[np.ndarray, " F"]) -> Surface:
+def clean(surface: AssetSurface, visible: Bool[np.ndarray, " F"]) -> AssetSurface:
     """Keep the visible part of a surface, remove small components, and close small holes.
 
     Raises:
@@ -30,7 +30,7 @@ def clean(surface: Surface, visible: Bool[np.ndarray, " F"]) -> Surface:
     return close_holes(remove_small_components(keep_visible(surface, visible)))
 
 
-def keep_visible(surface: Surface, visible: Bool[np.ndarray, " F"]) -> Surface:
+def keep_visible(surface: AssetSurface, visible: Bool[np.ndarray, " F"]) -> AssetSurface:
     """Keep visible triangles, the triangles that touch them, and invisible patches of at most `HOLE`."""
     on_visible = np.zeros(len(surface.vertices), dtype=bool)
     on_visible[surface.faces[visible]] = True
@@ -44,14 +44,14 @@ def keep_visible(surface: Surface, visible: Bool[np.ndarray, " F"]) -> Surface:
     return surface.part(kept)
 
 
-def remove_small_components(surface: Surface) -> Surface:
+def remove_small_components(surface: AssetSurface) -> AssetSurface:
     """Remove components whose area is below `MIN_COMPONENT` of the largest one's."""
     component = _components(surface)
     area = np.bincount(component, surface.mesh().area_faces)
     return surface.part((area >= MIN_COMPONENT * area.max())[component])
 
 
-def close_holes(surface: Surface) -> Surface:
+def close_holes(surface: AssetSurface) -> AssetSurface:
     """Close each border of at most `HOLE` by a fan of triangles around its centre, oriented consistently."""
     vertices, fans = [surface.vertices], []
     count = len(surface.vertices)
@@ -66,10 +66,10 @@ def close_holes(surface: Surface) -> Surface:
         return surface
     fan = creased(np.concatenate(vertices), np.concatenate(fans))
     faces = np.concatenate([surface.faces, fan.faces])
-    return Surface(fan.vertices, faces, np.concatenate([surface.normals, fan.normals]))
+    return AssetSurface(fan.vertices, faces, np.concatenate([surface.normals, fan.normals]))
 
 
-def _components(surface: Surface) -> Int[np.ndarray, " F"]:
+def _components(surface: AssetSurface) -> Int[np.ndarray, " F"]:
     """Label the triangles by connected component; triangles are connected by shared edges."""
     if not len(surface.faces):
         return np.zeros(0, dtype=np.int64)
@@ -78,12 +78,12 @@ def _components(surface: Surface) -> Int[np.ndarray, " F"]:
     return np.asarray(labels).astype(np.int64)
 
 
-def _width(surface: Surface, faces: Int[np.ndarray, "K 3"]) -> float:
+def _width(surface: AssetSurface, faces: Int[np.ndarray, "K 3"]) -> float:
     """Longest side of the bounding box of some triangles."""
     return float(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0).max())
 
 
-def _borders(surface: Surface) -> list[Int[np.ndarray, " L"]]:
+def _borders(surface: AssetSurface) -> list[Int[np.ndarray, " L"]]:
     """Closed loops of border edges, in the direction of the triangles that they belong to.
 
     Loops that touch at a vertex are ambiguous and are left out.

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.atlas import Unwrapped, unwrap
-from neilfpp_method.export.asset.bake import bake
+from neilfpp_method.export.asset.bake import Detail, bake
 from neilfpp_method.export.asset.clean import clean
 from neilfpp_method.export.asset.files import write_asset
 from neilfpp_method.export.asset.simplify import MIN_FACES, simplified
@@ -120,8 +120,8 @@ def export_asset(
     mesh = unwrap(coarse.surface, options.texture_size)
     expected = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
     with bar("textures") as advance:
-        reach = max(REACH_FACTOR * distance.near, MIN_REACH)
-        textures = bake(run, mesh, fine, reach, options.texture_size, expected, advance)
+        detail = Detail(fine, reach=max(REACH_FACTOR * distance.near, MIN_REACH))
+        textures = bake(run, mesh, detail, options.texture_size, expected, advance)
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
     )

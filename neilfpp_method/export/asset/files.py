@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.ply import NORMAL, write_ply
 from neilfpp_method.export.asset.atlas import Unwrapped
 from neilfpp_method.export.asset.bake import Textures
@@ -17,7 +18,6 @@ from neilfpp_method.export.asset.glb import glb_bytes
 from neilfpp_method.export.asset.scene_file import describe_scene
 from neilfpp_method.export.asset.usd import has_usd, usd_text
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.train.json_files import write_json
 from neilfpp_method.train.run import Run
 
 __all__ = ["write_asset"]

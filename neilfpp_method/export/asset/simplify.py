@@ -8,7 +8,7 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-from neilfpp_method.export.asset.surface import Surface, creased, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, meet_along
 
 __all__ = ["Distance", "Simplified", "distance_between", "simplified"]
 
@@ -43,11 +43,11 @@ class Distance:
 class Simplified:
     """A coarse surface, and the distance from the fine surface to it."""
 
-    surface: Surface
+    surface: AssetSurface
     distance: Distance
 
 
-def simplified(fine: Surface, most_faces: int, error: float) -> Simplified:
+def simplified(fine: AssetSurface, most_faces: int, error: float) -> Simplified:
     """Reduce the number of triangles to `most_faces`, then halve it while the distance stays within `error`.
 
     Args:
@@ -66,7 +66,7 @@ def simplified(fine: Surface, most_faces: int, error: float) -> Simplified:
     return best
 
 
-def distance_between(fine: Surface, coarse: Surface) -> Distance:
+def distance_between(fine: AssetSurface, coarse: AssetSurface) -> Distance:
     """Measure the distance along the normals of the fine surface, at points spread uniformly over it."""
     points, face = trimesh.sample.sample_surface(fine.mesh(), SAMPLES, seed=0)
     normals = fine.mesh().face_normals[face]
@@ -76,7 +76,7 @@ def distance_between(fine: Surface, coarse: Surface) -> Distance:
     return Distance(near, 1 - len(distances) / SAMPLES)
 
 
-def _with_faces(fine: Surface, count: int) -> Simplified:
+def _with_faces(fine: AssetSurface, count: int) -> Simplified:
     """Decimate by quadric errors (Garland and Heckbert 1997)."""
     if count >= len(fine.faces):
         mesh = fine.mesh()

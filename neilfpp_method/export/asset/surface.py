@@ -18,7 +18,7 @@ from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_trac
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.train.run import Run
 
-__all__ = ["NormalHits", "Surface", "creased", "fine_surface", "first_hits", "meet_along"]
+__all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "meet_along"]
 
 POINTS_AT_ONCE = 2**14
 """Number of points per call of the host's normal smoothing, which reads 32 neighbours of each."""
@@ -27,14 +27,14 @@ STEP_BACK = 1e-4
 
 
 @dataclass(frozen=True)
-class Surface:
+class AssetSurface:
     """Triangles in the scene frame, oriented outwards, with a unit normal at each corner."""
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     normals: Float[np.ndarray, "F 3 3"]
 
-    def part(self, chosen: Shaped[np.ndarray, " K"]) -> Surface:
+    def part(self, chosen: Shaped[np.ndarray, " K"]) -> AssetSurface:
         """Select triangles by index or mask; all vertices are kept."""
         return replace(self, faces=self.faces[chosen], normals=self.normals[chosen])
 
@@ -48,7 +48,7 @@ class Surface:
 
 
 @torch.no_grad()
-def fine_surface(run: Run, resolution: int) -> Surface:
+def fine_surface(run: Run, resolution: int) -> AssetSurface:
     """Return the surface that `export --what mesh` writes, with the normals that the run uses for shading.
 
     Raises:
@@ -58,24 +58,26 @@ def fine_surface(run: Run, resolution: int) -> Surface:
     faces, vertices = np.array(mesh.faces), np.array(mesh.vertices, dtype=np.float64)
     if isinstance(host, MeshHost):
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
-        return Surface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
+        return AssetSurface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
     device = next(run.model.parameters()).device
     position, normal = (
         torch.as_tensor(np.array(a), dtype=torch.float32, device=device)
         for a in (vertices, mesh.vertex_normals)
     )
-    return Surface(vertices, faces, _shading_normals(host, position, normal)[faces])
+    return AssetSurface(vertices, faces, _shading_normals(host, position, normal)[faces])
 
 
-def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Surface:
+def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> AssetSurface:
     """Build a surface with normals from its triangles: smooth, except at creases (`corner_normals`)."""
     mesh = Mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
     triangles = mesh.vertices[mesh.faces]
     across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return Surface(vertices, faces, corner_normals(mesh, safe_normalize(across, eps=1e-18)).double().numpy())
+    return AssetSurface(
+        vertices, faces, corner_normals(mesh, safe_normalize(across, eps=1e-18)).double().numpy()
+    )
 
 
-def first_hits(surface: Surface) -> FirstHits:
+def first_hits(surface: AssetSurface) -> FirstHits:
     """Build a function that returns the first triangle hit by each ray; uses Embree if it is installed."""
     triangles = surface.triangles()
     return embree_tracer(triangles) or tree_tracer(build_tree(triangles))
@@ -99,7 +101,7 @@ class NormalHits:
 
 
 def meet_along(
-    surface: Surface,
+    surface: AssetSurface,
     tracer: FirstHits,
     position: Float[np.ndarray, "N 3"],
     normal: Float[np.ndarray, "N 3"],

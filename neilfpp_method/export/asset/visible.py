@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool
 
 from neilfpp_method.data.views import Camera, CameraRays, project
-from neilfpp_method.export.asset.surface import Surface, first_hits
+from neilfpp_method.export.asset.surface import AssetSurface, first_hits
 
 __all__ = ["visible_faces"]
 
@@ -27,7 +27,7 @@ for the triangle to count as visible.
 
 
 @torch.no_grad()
-def visible_faces(surface: Surface, cameras: Sequence[Camera]) -> Bool[np.ndarray, " F"]:
+def visible_faces(surface: AssetSurface, cameras: Sequence[Camera]) -> Bool[np.ndarray, " F"]:
     """Find the triangles whose outside is the first hit of a ray through a pixel, or whose centre is visible.
 
     Rays through pixels find large triangles; rays to the centres find triangles smaller than a pixel.

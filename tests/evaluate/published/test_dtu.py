@@ -13,7 +13,7 @@ from scipy.io import savemat
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
-from neilfpp_method.evaluate.published.dtu import Observed, chamfer_of_scan, read_scan
+from neilfpp_method.evaluate.published.dtu import ScanData, chamfer_of_scan, read_scan
 from neilfpp_method.evaluate.published.dtu_surface import capped_mean, surface_samples, thinned
 from tests.data.make_capture import make_capture
 from tests.evaluate.test_protocols import make_run
@@ -25,10 +25,10 @@ def triangle(height: float = 0.0, size: float = 8.0) -> np.ndarray:
     return np.array([[0, 0, height], [size, 0, height], [0, size, height]], float)
 
 
-def scan(points: np.ndarray, plane: tuple[float, ...] = (0, 0, 1, 5)) -> Observed:
+def scan(points: np.ndarray, plane: tuple[float, ...] = (0, 0, 1, 5)) -> ScanData:
     """A scan in which a box of 20 mm is observed completely, and the ground is 5 mm below."""
     low, high = np.array([-5.0, -5, -5]), np.array([15.0, 15, 15])
-    return Observed(np.ones((21, 21, 21), np.uint8), low, high, 1.0, np.array(plane, float), points)
+    return ScanData(np.ones((21, 21, 21), np.uint8), low, high, 1.0, np.array(plane, float), points)
 
 
 def lattice(vertices: np.ndarray, spacing: float) -> list[tuple[float, ...]]:
@@ -86,7 +86,7 @@ def test_the_distance_of_parallel_planes():
     )
 
 
-def by_hand(vertices: np.ndarray, faces: np.ndarray, seen: Observed) -> tuple[float, float]:
+def by_hand(vertices: np.ndarray, faces: np.ndarray, seen: ScanData) -> tuple[float, float]:
     """Both means, from a table of all distances."""
     points = [p for face in faces for p in lattice(vertices[face], 0.2)]
     points += [tuple(v) for v in vertices]

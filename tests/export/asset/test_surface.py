@@ -12,11 +12,11 @@ from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_visible, remove_small_components
 from neilfpp_method.export.asset.simplify import distance_between, simplified
-from neilfpp_method.export.asset.surface import Surface, creased, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, meet_along
 from neilfpp_method.export.asset.visible import visible_faces
 
 
-def surface(*shapes: trimesh.Trimesh) -> Surface:
+def surface(*shapes: trimesh.Trimesh) -> AssetSurface:
     whole = trimesh.util.concatenate(shapes) if len(shapes) > 1 else shapes[0]
     return creased(np.array(whole.vertices, dtype=np.float64), np.array(whole.faces))
 
