@@ -87,7 +87,13 @@ def test_points_that_hide_nothing_have_no_hull(position):
     assert hull == "the point cloud hides almost nothing from the cameras"
 
 
-def test_a_point_hides_only_what_its_front_faces(monkeypatch):
+@pytest.mark.parametrize("factor", [-1.0, float("nan")])
+def test_normals_that_point_inwards_or_nowhere_give_no_hull(factor):
+    points = OrientedPoints(ball().position, factor * ball().normal)
+    assert isinstance(find_cloud_hull(points, cameras(24), RADIUS, RESOLUTION), str)
+
+
+def test_a_point_hides_only_what_its_front_faces():
     """Points seen from behind belong to the other side of an object, so they limit nothing."""
     points = ball()
     inside_out = OrientedPoints(points.position, -points.normal)
