@@ -311,8 +311,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "mirrored cameras are taken",
         "data/views.py",
-        "< 1e-3 and np.linalg.det(rotation) > 0",
-        "< 1e-3",
+        "if np.linalg.det(rotation) < 0:",
+        "if np.linalg.det(rotation) < -2:",
         "hard_cases/test_captures.py",
     ),
     Mutant(

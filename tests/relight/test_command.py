@@ -300,7 +300,7 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--views", "turntable", "000"], ("--views turntable",)),
         (["--checkpoint", "sdf_init"], ("no material",)),
         (
-            ["--set", "metallic=1", "--box", "90", "90", "90", "91", "91", "91"],
+            ["--set", "metallic=1", "--box", "90", "90", "90", "91", "91", "91", "--force"],
             ("--box contains no part of the surface", "world frame"),
         ),
         (["--rotate", "nan"], ("--rotate",)),

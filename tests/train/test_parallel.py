@@ -16,10 +16,12 @@ import pytest
 import torch
 
 from neilfpp_method.cli import main
+from neilfpp_method.data.capture import load_capture
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.train.start import start_geometry
 from tests.train.small_runs import differences, small_config, small_training
 
 REPOSITORY = Path(__file__).parents[2]
@@ -79,6 +81,7 @@ def test_two_processes_end_with_one_model(tmp_path, capture):
     # The first step, computed here for both processes one after the other.
     config = small_config(sdf_steps=2, material_steps=2, joint_steps=2)
     model_of = small_training(capture, tmp_path / "here", config)
+    start_geometry(model_of.model, load_capture(capture), config)
     gradients = [local_gradients(model_of, rank) for rank in (0, 1)]
     seen = [recorded(tmp_path, f"gradients_{rank}") for rank in (0, 1)]
     assert differences(*seen) == []
