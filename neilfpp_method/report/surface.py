@@ -73,7 +73,7 @@ def packed_surface(run: Run) -> dict[str, Any]:
     }
     if run.has_material:
         points = torch.from_numpy(low + position / 65535 * extent).float()
-        material = materials_in_parts(run, points.to(next(run.model.parameters()).device))
+        material = materials_in_parts(run, points.to(run.device))
         roughness_metallic = torch.cat([material.roughness, material.metallic], -1)
         packed["color"] = _base64(_bytes(tone_map(material.base_color)))
         packed["material"] = _base64(_bytes(roughness_metallic))
