@@ -42,7 +42,7 @@ def views_section(views: ReportViews, held_out: bool) -> Html:
         element("p", note, class_="pale"),
         _choices("view", "View", names),
         _choices("layer", "Map", [layer.title for layer in views.layers]),
-        _choices("beside", "Compare with", ["truth", "photograph", "error"], values=True),
+        _radios("beside", "Compare with", [(name, name) for name in ("truth", "photograph", "error")]),
         element("figure", _stage(views), element("figcaption", id="views-caption", aria_live="polite")),
         *strips,
         element("noscript", element("p", "Without JavaScript this page shows only the estimates.")),
@@ -189,11 +189,13 @@ def _thumbnail(title: str, url: str, view: str) -> Html:
     )
 
 
-def _choices(name: str, title: str, texts: Sequence[str], values: bool = False) -> Html:
-    return _radios(name, title, [(text if values else str(i), text) for i, text in enumerate(texts)])
+def _choices(name: str, title: str, texts: Sequence[str]) -> Html:
+    """Radio buttons whose values are the numbers of the texts."""
+    return _radios(name, title, [(str(i), text) for i, text in enumerate(texts)])
 
 
 def _radios(name: str, title: str, choices: Sequence[tuple[str, str]]) -> Html:
+    """Radio buttons for pairs of value and text; the first one is chosen."""
     labels = (
         element(
             "label",
