@@ -106,7 +106,7 @@ def measure_residuals(run: Run) -> TrainingResiduals:
         UserError: there are no training views, or one cannot be read.
     """
     model = run.model
-    views = TrainingViews(run.capture, next(model.parameters()).device)
+    views = TrainingViews(run.capture, run.device)
     errors, misfits, shares = [], [], []
     pixels = views.evenly_spaced_pixels(PIXELS)
     for start in range(0, len(pixels), POINTS_AT_ONCE):
@@ -206,7 +206,7 @@ def surface_at_pixels(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"
     depth = torch.from_numpy(view.maps["depth"].reshape(-1, 1)[pixels])
     normal = torch.from_numpy(view.maps["normal"].reshape(-1, 3)[pixels])
     points = OrientedPoints(rays.origins + depth * rays.directions, normal)
-    return points.to(next(run.model.parameters()).device)
+    return points.to(run.device)
 
 
 def _smoothed(

@@ -136,7 +136,7 @@ def _rendered_points(run: Run, rendered: RenderedView) -> list[LightPoint]:
 def _incident_light(
     run: Run, points: Sequence[LightPoint], directions: Float[np.ndarray, "H W 3"]
 ) -> list[Float[np.ndarray, "H W 3"]]:
-    device = next(run.model.parameters()).device
+    device = run.device
     wi = torch.from_numpy(directions).reshape(1, -1, 3).to(device)
     positions = [torch.as_tensor(point.position, device=device)[None] for point in points]
     return [run.model.incident_light(x, wi).reshape(directions.shape).cpu().numpy() for x in positions]

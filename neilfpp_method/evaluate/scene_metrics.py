@@ -41,7 +41,7 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     low, high = true.bounds[0] - margin, true.bounds[1] + margin
     volume = run.config.volume
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
-    device = next(run.model.parameters()).device
+    device = run.device
     # Stay inside the sphere that may close the scene, which is no surface of the object. Parts outside the
     # box are removed below.
     radius = min(float(corner), volume.radius - HIT_RADIUS)
@@ -83,7 +83,7 @@ def light_metrics(run: Run, field: LightField, mesh: Mesh | None) -> dict[str, f
 
 @torch.no_grad()
 def _incident_light(run: Run, field: LightField) -> Float[np.ndarray, "N S 3"]:
-    device = next(run.model.parameters()).device
+    device = run.device
     directions_at_once = EVAL_RAYS * run.config.shading.eval_samples
     points = max(1, directions_at_once // field.wi.shape[1])
     chunks = zip(field.position.split(points), field.wi.split(points), strict=True)

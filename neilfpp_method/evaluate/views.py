@@ -60,7 +60,7 @@ def render_view(
     each. If the run has no material yet, `rgb` is the host's colour, and the maps of the material are 0.
     """
     view = run.capture.views[view_index]
-    device = next(run.model.parameters()).device
+    device = run.device
     rays = camera_rays(run.capture.scene_camera(view))
     parts = -(-len(rays) // EVAL_RAYS)
     combined: dict[str, Tensor] = {}

@@ -135,10 +135,8 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
             f"{run.path}: the host of this run has no distance field and no mesh",
             "export from a run of another host",
         )
-    volume = run.config.volume
     # Stay inside the sphere that may close the scene, which is no surface of the object.
-    device = next(run.model.parameters()).device
-    return extract_mesh(host.sdf, volume.radius - HIT_RADIUS, resolution, device=device)
+    return extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=run.device)
 
 
 def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
@@ -151,8 +149,7 @@ def export_mesh(run: Run, path: Path, resolution: int = 256) -> trimesh.Trimesh:
         UserError: `surface_mesh` fails.
     """
     mesh = surface_mesh(run, resolution)
-    device = next(run.model.parameters()).device
-    position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=device)
+    position = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float32, device=run.device)
     columns = dict(zip(NORMAL, mesh.vertex_normals.astype(np.float32).T, strict=True))
     if run.has_material:
         material = materials_in_parts(run, position)

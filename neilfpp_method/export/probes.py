@@ -29,8 +29,7 @@ def spread_over_surface(run: Run, count: int) -> OrientedPoints:
     Raises:
         UserError: no training view sees a surface.
     """
-    device = next(run.model.parameters()).device
-    points = OrientedPoints.joined(list(_visible_points(run, device)))
+    points = OrientedPoints.joined(list(_visible_points(run)))
     if not len(points):
         raise UserError(f"{run.path}: no training view sees a surface", "train the run for longer")
     return points[spread(points, count)]
@@ -68,13 +67,13 @@ def probe(
     return radiance
 
 
-def _visible_points(run: Run, device: torch.device) -> Iterator[OrientedPoints]:
+def _visible_points(run: Run) -> Iterator[OrientedPoints]:
     """Surface points at random pixels of each training view."""
     views = run.capture.train_views
     generator = torch.Generator().manual_seed(0)
     for view in views:
         rays = camera_rays(run.capture.scene_camera(view))
         pixels = torch.randperm(len(rays), generator=generator)[: -(-CANDIDATES // len(views))]
-        hits = run.model.host.render(rays[pixels].to(device))
+        hits = run.model.host.render(rays[pixels].to(run.device))
         is_hit = hits.is_hit(run.config.shading.hit_share)
         yield OrientedPoints(hits.position[is_hit], hits.normal[is_hit])

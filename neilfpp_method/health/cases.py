@@ -107,26 +107,26 @@ def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
     if measured.opaque < MIN_OPAQUE:
         return [
             Finding(
-                "no_surface",
-                True,
-                step,
-                f"only {measured.opaque:.0%} of the object's pixels show a surface",
-                "a scene box that misses the object, or masks that are inverted",
-                "check that the object lies in the unit sphere of the scene and that masks are 1 on it "
-                "(`neilfpp inspect` draws both for a capture)",
+                case="no_surface",
+                severe=True,
+                step=step,
+                what=f"only {measured.opaque:.0%} of the object's pixels show a surface",
+                cause="a scene box that misses the object, or masks that are inverted",
+                remedy="check that the object lies in the unit sphere of the scene and that masks are 1 on "
+                "it (`neilfpp inspect` draws both for a capture)",
             )
         ]
     if measured.sharp < MIN_SHARP:
         return [
             Finding(
-                "fog",
-                True,
-                step,
-                f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is "
-                "fog",
-                "a scene box that contains the cameras, or too few views, steps or masks",
-                "check the scene box (`neilfpp inspect` draws that of a capture), give masks, or train the "
-                "geometry for more steps (train.sdf_steps)",
+                case="fog",
+                severe=True,
+                step=step,
+                what=f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene "
+                "is fog",
+                cause="a scene box that contains the cameras, or too few views, steps or masks",
+                remedy="check the scene box (`neilfpp inspect` draws that of a capture), give masks, or "
+                "train the geometry for more steps (train.sdf_steps)",
             )
         ]
     return []
@@ -138,12 +138,13 @@ def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
         return []
     return [
         Finding(
-            "material_at_bounds",
-            False,
-            step,
-            f"the base colour of {measured.at_bound:.0%} of the surface is black or white",
-            "a light with a wrong scale",
-            "give a known environment map (light.map, in `neilfpp train` --light), or read docs/light.md",
+            case="material_at_bounds",
+            severe=False,
+            step=step,
+            what=f"the base colour of {measured.at_bound:.0%} of the surface is black or white",
+            cause="a light with a wrong scale",
+            remedy="give a known environment map (light.map, in `neilfpp train` --light), or read "
+            "docs/light.md",
         )
     ]
 
@@ -154,12 +155,12 @@ def nothing_shaded(steps: int, step: int) -> list[Finding]:
         return []
     return [
         Finding(
-            "nothing_shaded",
-            True,
-            step,
-            f"no surface point was shaded for {steps} steps, so material and light learn nothing",
-            "a distance field that never formed a surface",
-            "look at a rendering of the geometry (in a run folder previews/sdf_init.png)",
+            case="nothing_shaded",
+            severe=True,
+            step=step,
+            what=f"no surface point was shaded for {steps} steps, so material and light learn nothing",
+            cause="a distance field that never formed a surface",
+            remedy="look at a rendering of the geometry (in a run folder previews/sdf_init.png)",
         )
     ]
 
@@ -170,13 +171,13 @@ def few_light_points(points: int, step: int) -> list[Finding]:
         return []
     return [
         Finding(
-            "few_light_points",
-            False,
-            step,
-            f"the light was fitted to only {points} surface points, without a decision about lamps",
-            "masks or a surface that leave few pixels to shade",
-            "check the masks and a rendering of the geometry, or use more rays per step (train.rays, in your "
-            "own loop the size of the batch)",
+            case="few_light_points",
+            severe=False,
+            step=step,
+            what=f"the light was fitted to only {points} surface points, without a decision about lamps",
+            cause="masks or a surface that leave few pixels to shade",
+            remedy="check the masks and a rendering of the geometry, or use more rays per step (train.rays, "
+            "in your own loop the size of the batch)",
         )
     ]
 
@@ -187,12 +188,12 @@ def skipped_steps(skipped: int, step: int) -> list[Finding]:
         return []
     return [
         Finding(
-            "skipped_steps",
-            False,
-            step,
-            f"{skipped} of {step} steps were skipped, as they were not finite",
-            "pixels far above the rest, or learning rates that are too high",
-            "look for the brightest pixels (`neilfpp inspect` reports those of a capture), or lower the "
-            "learning rates (optimizer)",
+            case="skipped_steps",
+            severe=False,
+            step=step,
+            what=f"{skipped} of {step} steps were skipped, as they were not finite",
+            cause="pixels far above the rest, or learning rates that are too high",
+            remedy="look for the brightest pixels (`neilfpp inspect` reports those of a capture), or lower "
+            "the learning rates (optimizer)",
         )
     ]

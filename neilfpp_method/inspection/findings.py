@@ -142,15 +142,17 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
 
 def problems(inspection: Inspection) -> tuple[str, ...]:
     """Return one line for the console per finding that is a problem."""
-    return tuple(
-        f"problem: {finding.line()}" for finding in inspection.findings if finding.severity == "problem"
-    )
+    return _lines_of_problems(inspection.findings)
 
 
 def problems_of_poses(capture: Capture) -> tuple[str, ...]:
     """The same as `problems`, for cameras and point cloud only; fast, because no image is read."""
     found = (*_of_cameras(capture, camera_placement(capture)), *_of_scene(capture))
-    return tuple(f"problem: {finding.line()}" for finding in found if finding.severity == "problem")
+    return _lines_of_problems(found)
+
+
+def _lines_of_problems(findings: Sequence[Finding]) -> tuple[str, ...]:
+    return tuple(f"problem: {finding.line()}" for finding in findings if finding.severity == "problem")
 
 
 def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:

@@ -16,6 +16,8 @@ PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
 """Colours of the background, of text, and of secondary text."""
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
 """Frame colours of views with a problem, with a warning, and without findings."""
+SEVEREST_FIRST = (PROBLEM, WARNING, FINE)
+"""Order in which views are drawn, by the colour of their frame."""
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
 """Side of a view, height of its label, space between views, and margin of the sheet, in pixels."""
 COLUMNS = 7
@@ -31,8 +33,7 @@ KEY = 0.25
 def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the picture. All views have the same exposure, so that differences are visible."""
     colors = _colors(inspection)
-    ranks = [{PROBLEM: 0, WARNING: 1, FINE: 2}[color] for color in colors]
-    order = sorted(range(len(ranks)), key=lambda i: ranks[i])[:MAX_DRAWN]
+    order = sorted(range(len(colors)), key=lambda i: SEVEREST_FIRST.index(colors[i]))[:MAX_DRAWN]
     rows = -(-len(order) // COLUMNS)
     width = 2 * MARGIN + COLUMNS * (CELL + GAP) - GAP
     top = MARGIN + 70 + PLAN + 2 * GAP
@@ -45,9 +46,15 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
         plan = Image.fromarray(_plan(inspection, axes, colors, title))
         sheet.paste(plan, (MARGIN + k * (PLAN + 2 * GAP), MARGIN + 70))
     _list(pen, (MARGIN + 2 * (PLAN + 2 * GAP), MARGIN + 78), inspection)
+    exposure = KEY / float(np.median([v.luminance for v in inspection.views if v.luminance > 0] or [1.0]))
     for place, i in enumerate(order):
         corner = (MARGIN + place % COLUMNS * (CELL + GAP), top + place // COLUMNS * (CELL + LABEL + GAP))
-        _cell(sheet, pen, corner, inspection, i, colors[i])
+        view = inspection.views[i]
+        picture = Image.fromarray(_shown(view.small, exposure))
+        kinds = [f.kind.replace("_", " ") for f in inspection.findings if view.name in f.views]
+        _cell(sheet, pen, corner, picture, colors[i])
+        _write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
+        _write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, colors[i])
     return np.asarray(sheet)
 
 
@@ -96,21 +103,15 @@ def _cell(
     sheet: Image.Image,
     pen: ImageDraw.ImageDraw,
     corner: tuple[int, int],
-    inspection: Inspection,
-    i: int,
+    picture: Image.Image,
     color: tuple[int, int, int],
 ) -> None:
-    view = inspection.views[i]
-    middle = float(np.median([v.luminance for v in inspection.views if v.luminance > 0] or [1.0]))
-    picture = Image.fromarray(_shown(view.small, KEY / middle))
+    """Draw a view in a frame of the given colour."""
     picture.thumbnail((CELL, CELL))
     sheet.paste(picture, (corner[0] + (CELL - picture.width) // 2, corner[1] + (CELL - picture.height) // 2))
     pen.rectangle(
         [corner[0] - 3, corner[1] - 3, corner[0] + CELL + 2, corner[1] + CELL + 2], outline=color, width=3
     )
-    kinds = [finding.kind.replace("_", " ") for finding in inspection.findings if view.name in finding.views]
-    _write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
-    _write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, color)
 
 
 def _shown(radiance: Float[np.ndarray, "h w 3"], exposure: float) -> UInt8[np.ndarray, "h w 3"]:

@@ -140,9 +140,9 @@ class NeilfMethod(Model):
             own_losses=self.config.host_losses > 0.0,
         )
         self.proxy = proxy_for(host, settings)
-        whole = ForeignHost(host, borrowed=False, proxy=self.proxy)
-        self.neilf = NeilfModel(whole, settings, facts)
-        self.neilf.observers.append(lambda batch, hits: whole.show_proxy(batch.rays, hits))
+        foreign_host = ForeignHost(host, borrowed=False, proxy=self.proxy)
+        self.neilf = NeilfModel(foreign_host, settings, facts)
+        self.neilf.observers.append(lambda batch, hits: foreign_host.show_proxy(batch.rays, hits))
         if self.proxy is not None:
             CONSOLE.log(
                 f"{name} cannot trace rays cheaply: shadows and inter-reflection are traced on a proxy of "

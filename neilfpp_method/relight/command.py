@@ -221,7 +221,7 @@ def _shots(request: RelightRequest, run: Run) -> list[Shot]:
 
 def _lights(request: RelightRequest, run: Run, say: Callable[[str], None]) -> dict[str, Sky]:
     """The environment maps by name, on the device of the run; the run's own light if no map is given."""
-    device = next(run.model.parameters()).device
+    device = run.device
     if not request.env:
         if not isinstance(run.model.light, EnvironmentLight):
             raise UserError(

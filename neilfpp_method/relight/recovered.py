@@ -44,7 +44,7 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
     Raises:
         UserError: the run has no surface.
     """
-    host, device = run.model.host, next(run.model.parameters()).device
+    host, device = run.model.host, run.device
     if isinstance(host, MeshHost):
         triangles, normals = host.triangles.float(), host.corner_normals.float()
         if isinstance(host, SmoothsNormals) and run.config.volume.normal_radius > 0:

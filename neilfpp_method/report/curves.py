@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from neilfpp_method.report.markup import Html, element, joined
+from neilfpp_method.report.svg import svg_text
 from neilfpp_method.timing.ledger import WORK
 from neilfpp_method.train.quality import QualityCheck
 
@@ -58,11 +59,11 @@ def quality_curve(checks: Sequence[QualityCheck]) -> Html | None:
         across, up = seconds / max(right, 1e-9), (value - low) / (high - low)
         return LEFT + across * (WIDTH - LEFT - RIGHT), TOP + (1 - up) * (HEIGHT - TOP - BOTTOM)
 
-    grid = [_text(to_pixels(x, low)[0], HEIGHT - BOTTOM + 18, f"{x:g}", "middle") for x in x_ticks]
+    grid = [svg_text(to_pixels(x, low)[0], HEIGHT - BOTTOM + 18, f"{x:g}", "middle") for x in x_ticks]
     for y in y_ticks:
         height = to_pixels(0.0, y)[1]
         grid.append(_line(LEFT, height, WIDTH - RIGHT, height))
-        grid.append(_text(LEFT - 6, height + 4, f"{y:g}", "end"))
+        grid.append(svg_text(LEFT - 6, height + 4, f"{y:g}", "end"))
     lines, labels = [], []
     for name, points, color in (("R", radiance, COLORS[0]), ("PBR", physical, COLORS[3])):
         if points:
@@ -73,8 +74,8 @@ def quality_curve(checks: Sequence[QualityCheck]) -> Html | None:
     previous = -math.inf
     for x, y, text in sorted(labels, key=lambda label: label[1]):
         previous = max(y, previous + LABEL_HEIGHT)
-        lines.append(_text(x, previous, text, "start"))
-    caption = _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 4, "seconds of the run", "middle")
+        lines.append(svg_text(x, previous, text, "start"))
+    caption = svg_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 4, "seconds of the run", "middle")
     return _svg(HEIGHT, "PSNR of held-back pixels over seconds", *grid, *lines, caption)
 
 
@@ -95,7 +96,7 @@ def work_bars(work: Mapping[str, Mapping[str, float]], titles: Mapping[str, str]
     bars, drawn = [], set()
     for number, (stage, parts) in enumerate(work.items()):
         top, x = TOP + number * (BAR + GAP), STAGE_WIDTH
-        bars.append(_text(x - 8, top + 15, titles.get(stage, stage), "end"))
+        bars.append(svg_text(x - 8, top + 15, titles.get(stage, stage), "end"))
         for kind, color in zip(WORK, COLORS, strict=True):
             width = (WIDTH - STAGE_WIDTH - SECONDS_WIDTH) * parts.get(kind, 0.0) / longest
             if width > 0:
@@ -104,7 +105,7 @@ def work_bars(work: Mapping[str, Mapping[str, float]], titles: Mapping[str, str]
                 bars.append(element("rect", tooltip, **box))
                 drawn.add(kind)
             x += width
-        bars.append(_text(x + 6, top + 15, f"{sums[stage]:.0f} s", "start"))
+        bars.append(svg_text(x + 6, top + 15, f"{sums[stage]:.0f} s", "start"))
     height = TOP + len(work) * (BAR + GAP)
     legend = (
         element("span", element("span", "■ ", style=f"color: {color}"), f"{kind.replace('_', ' ')}  ")
@@ -137,11 +138,6 @@ def _curve(points: Sequence[tuple[float, float]], color: str) -> Html:
 def _line(x: float, y: float, to_x: float, to_y: float) -> Html:
     ends = {"x1": f"{x:.1f}", "y1": f"{y:.1f}", "x2": f"{to_x:.1f}", "y2": f"{to_y:.1f}"}
     return element("line", **ends, stroke="currentColor", stroke_opacity=0.15)
-
-
-def _text(x: float, y: float, text: str, anchor: str) -> Html:
-    place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text_anchor": anchor}
-    return element("text", text, **place, fill="currentColor", font_size=12)
 
 
 def _svg(height: float, label: str, *children: Html) -> Html:

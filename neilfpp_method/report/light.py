@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,22 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.report.encoded import encoded
 from neilfpp_method.train.run import Run
 
-__all__ = ["lamps_of", "picture_of_map"]
+__all__ = ["MapPicture", "lamps_of", "picture_of_map"]
 
 MIN_HEIGHT = 192
 """Least height of the image, pixels. Texels are enlarged until it is reached, so that they are visible."""
 
 
-def picture_of_map(run: Run) -> tuple[str, float] | None:
-    """Return the environment map as a data URL, +z at the top, and its exposure.
+@dataclass(frozen=True)
+class MapPicture:
+    """The environment map, +z at the top, as a data URL; its radiance is multiplied by `exposure`."""
+
+    picture: str
+    exposure: float
+
+
+def picture_of_map(run: Run) -> MapPicture | None:
+    """Draw the environment map.
 
     Returns None if the run's light is no environment map, or no stage has estimated the light yet.
     """
@@ -30,7 +39,7 @@ def picture_of_map(run: Run) -> tuple[str, float] | None:
     exposure = auto_exposure(radiance.reshape(-1, 3))
     factor = max(1, -(-MIN_HEIGHT // len(radiance)))
     enlarged = np.kron(display_color(radiance, exposure), np.ones((factor, factor, 1), np.uint8))
-    return encoded(enlarged), exposure
+    return MapPicture(encoded(enlarged), exposure)
 
 
 def lamps_of(run: Run) -> list[dict[str, Any]]:

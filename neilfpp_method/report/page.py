@@ -6,19 +6,29 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from importlib import resources
+from typing import NamedTuple
 
 from neilfpp_method.report.markup import Html, element
 
-__all__ = ["page"]
+__all__ = ["PageSection", "page"]
 
 
-def page(title: str, subtitle: str, sections: Sequence[tuple[str, str, Html]]) -> str:
+class PageSection(NamedTuple):
+    """A section of the page."""
+
+    name: str
+    """Identifier, to which links lead."""
+    heading: str
+    content: Html
+
+
+def page(title: str, subtitle: str, sections: Sequence[PageSection]) -> str:
     """Build the page.
 
     Args:
         title: title of the page.
         subtitle: line below the title.
-        sections: identifier, heading and content of each section.
+        sections: the sections, in order.
     """
     static = resources.files("neilfpp_method.report") / "static"
     style = (static / "page.css").read_text("utf-8")
@@ -34,17 +44,19 @@ def page(title: str, subtitle: str, sections: Sequence[tuple[str, str, Html]]) -
         element("title", title),
         element("style", Html(style)),
     )
-    links = (element("a", heading, href=f"#{name}") for name, heading, _ in sections)
+    links = (element("a", section.heading, href=f"#{section.name}") for section in sections)
     body = element(
         "body",
         element("header", element("h1", title), element("p", subtitle, class_="pale")),
         element("nav", *links, aria_label="Sections"),
-        element(
-            "main", *(element("section", element("h2", h), content, id=name) for name, h, content in sections)
-        ),
+        element("main", *map(_section, sections)),
         *(element("script", Html(script)) for script in scripts),
     )
     return f"<!doctype html>\n{element('html', head, body, lang='en')}\n"
+
+
+def _section(section: PageSection) -> Html:
+    return element("section", element("h2", section.heading), section.content, id=section.name)
 
 
 def _sha256(text: str) -> str:

@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from neilfpp_method.report.light import MapPicture
 from neilfpp_method.report.markup import Html, cell, data_block, element, joined, table
 from neilfpp_method.report.views import LightPicture, ReportViews
 
 __all__ = ["light_section", "surface_section", "views_section"]
+
+WITH_MATERIAL = {0: "Preview", 1: "Base colour", 2: "Roughness", 3: "Metallic", 4: "Normal"}
+WITHOUT_MATERIAL = {5: "Shape", 4: "Normal"}
+"""Titles of the layers of the surface by their numbers in `viewer.js`."""
 
 
 def views_section(views: ReportViews, held_out: bool) -> Html:
@@ -37,7 +42,7 @@ def views_section(views: ReportViews, held_out: bool) -> Html:
         element("p", note, class_="pale"),
         _choices("view", "View", names),
         _choices("layer", "Map", [layer.title for layer in views.layers]),
-        _choices("beside", "Compare with", ["truth", "photograph", "error"], values=True),
+        _radios("beside", "Compare with", [(name, name) for name in ("truth", "photograph", "error")]),
         element("figure", _stage(views), element("figcaption", id="views-caption", aria_live="polite")),
         *strips,
         element("noscript", element("p", "Without JavaScript this page shows only the estimates.")),
@@ -70,7 +75,7 @@ def _views_data(views: ReportViews) -> dict[str, Any]:
             "title": layer.title,
             "note": layer.note,
             "largest": layer.largest,
-            "cells": [{"truth": cell.truth, "error": cell.error} for cell in layer.cells],
+            "cells": [{"truth": compared.truth, "error": compared.error} for compared in layer.cells],
         }
         for layer in views.layers
     ]
@@ -86,14 +91,9 @@ def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
     """
     if packed is None:
         return element("p", f"There is no surface to show: {reason}.")
-    layers = ["Preview", "Base colour", "Roughness", "Metallic", "Normal"]
-    choices = (
-        [(str(i), name) for i, name in enumerate(layers)]
-        if "color" in packed
-        else [("5", "Shape"), ("4", "Normal")]
-    )
+    layers = WITH_MATERIAL if "color" in packed else WITHOUT_MATERIAL
     return joined(
-        _radios("surface-layer", "Layer", choices),
+        _radios("surface-layer", "Layer", [(str(number), title) for number, title in layers.items()]),
         element(
             "canvas",
             id="surface-canvas",
@@ -126,7 +126,7 @@ def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
 
 def light_section(
     description: str,
-    picture: tuple[str, float] | None,
+    picture: MapPicture | None,
     lamps: Sequence[Mapping[str, Any]],
     points: Sequence[LightPicture],
 ) -> Html:
@@ -134,17 +134,16 @@ def light_section(
 
     Args:
         description: a phrase that describes the light.
-        picture: the environment map as a data URL and its exposure, or None.
+        picture: the environment map, or None.
         lamps: the lamps in the format of `lamps.json`.
         points: images of the incident light at surface points.
     """
     parts = [element("p", description[:1].upper() + description[1:] + ".")]
     if picture is not None:
-        caption = (
-            f"The environment map: +z at the top, the azimuth from left to right, exposure {picture[1]:.2g}."
-        )
+        axes = "+z at the top, the azimuth from left to right"
+        caption = f"The environment map: {axes}, exposure {picture.exposure:.2g}."
         alt = "The environment map in latitude-longitude projection"
-        image = element("img", class_="map", src=picture[0], alt=alt)
+        image = element("img", class_="map", src=picture.picture, alt=alt)
         parts.append(element("figure", image, element("figcaption", caption)))
     if lamps:
         head = ("lamp", "position (world frame)", "radius", "intensity (R, G, B)")
@@ -190,11 +189,13 @@ def _thumbnail(title: str, url: str, view: str) -> Html:
     )
 
 
-def _choices(name: str, title: str, texts: Sequence[str], values: bool = False) -> Html:
-    return _radios(name, title, [(text if values else str(i), text) for i, text in enumerate(texts)])
+def _choices(name: str, title: str, texts: Sequence[str]) -> Html:
+    """Radio buttons whose values are the numbers of the texts."""
+    return _radios(name, title, [(str(i), text) for i, text in enumerate(texts)])
 
 
 def _radios(name: str, title: str, choices: Sequence[tuple[str, str]]) -> Html:
+    """Radio buttons for pairs of value and text; the first one is chosen."""
     labels = (
         element(
             "label",

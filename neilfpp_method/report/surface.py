@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+from dataclasses import dataclass
 from typing import Any
 
 import fast_simplification
 import numpy as np
 import torch
 import trimesh
+from jaxtyping import Float
 
 from neilfpp_method.export.asset.clean import clean
 from neilfpp_method.export.asset.surface import AssetSurface, creased, fine_surface
@@ -53,11 +55,13 @@ def packed_surface(run: Run) -> dict[str, Any]:
             surface.vertices.astype(np.float32), surface.faces.astype(np.int32), target_count=FACES
         )
         surface = creased(np.asarray(points, np.float64), np.asarray(faces))
-    corners, normals = _corners(surface)
-    low, high = corners.min(0), corners.max(0)
+    corners = _corners(surface)
+    low, high = corners.position.min(0), corners.position.max(0)
     extent = np.maximum(high - low, 1e-9)
-    position = np.rint((corners - low) / extent * 65535).astype(np.uint16)
-    normal = np.rint(normals * 127).astype(np.int16)
+    position = np.rint((corners.position - low) / extent * 65535).astype(np.uint16)
+    # Corners that are equal after rounding become one vertex. To compare whole rows, normals take the type of
+    # the positions for a moment, bit by bit.
+    normal = np.rint(corners.normal * 127).astype(np.int16)
     rows, index = np.unique(
         np.concatenate([position, normal.view(np.uint16)], 1), axis=0, return_inverse=True
     )
@@ -73,17 +77,25 @@ def packed_surface(run: Run) -> dict[str, Any]:
     }
     if run.has_material:
         points = torch.from_numpy(low + position / 65535 * extent).float()
-        material = materials_in_parts(run, points.to(next(run.model.parameters()).device))
+        material = materials_in_parts(run, points.to(run.device))
         roughness_metallic = torch.cat([material.roughness, material.metallic], -1)
         packed["color"] = _base64(_bytes(tone_map(material.base_color)))
         packed["material"] = _base64(_bytes(roughness_metallic))
     return packed
 
 
-def _corners(surface: AssetSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Positions and normals of the corners of all triangles; large triangles are subdivided first."""
+@dataclass(frozen=True)
+class _Corners:
+    """The C corners of C / 3 triangles: positions and unit normals, scene frame."""
+
+    position: Float[np.ndarray, "C 3"]
+    normal: Float[np.ndarray, "C 3"]
+
+
+def _corners(surface: AssetSurface) -> _Corners:
+    """The corners of all triangles; large triangles are subdivided first."""
     if len(surface.faces) > FACES / 2:
-        return surface.vertices[surface.faces].reshape(-1, 3), surface.normals.reshape(-1, 3)
+        return _Corners(surface.vertices[surface.faces].reshape(-1, 3), surface.normals.reshape(-1, 3))
     # An equilateral triangle of area A has edges of length 2 √(A / √3).
     edge = EDGE_SLACK * 2 * np.sqrt(surface.mesh().area / FACES / np.sqrt(3))
     vertices, faces, source = trimesh.remesh.subdivide_to_size(
@@ -93,7 +105,7 @@ def _corners(surface: AssetSurface) -> tuple[np.ndarray, np.ndarray]:
     source = np.repeat(source, 3)
     weights = trimesh.triangles.points_to_barycentric(surface.vertices[surface.faces[source]], corners)
     normals = (np.nan_to_num(weights)[..., None] * surface.normals[source]).sum(1)
-    return corners, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+    return _Corners(corners, normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9))
 
 
 def _bytes(values: torch.Tensor) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from neilfpp_method.report.files import Files, changed_settings, read_files
 from neilfpp_method.report.light import lamps_of, picture_of_map
 from neilfpp_method.report.markup import Html, element, joined
 from neilfpp_method.report.measured import OWN, Measured
-from neilfpp_method.report.page import page
+from neilfpp_method.report.page import PageSection, page
 from neilfpp_method.report.surface import packed_surface
 from neilfpp_method.report.views import ReportViews, encode_views, run_for_display
 from neilfpp_method.schedule import Stage
@@ -109,47 +109,55 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
         surface, reason = packed_surface(small), ""
     except UserError as error:
         surface, reason = None, error.problem
-    notes = list(files.notes)
-    if run.step < files.steps:
-        stopped = f"Training was stopped after step {run.step} of {files.steps}."
-        notes.insert(0, f"{stopped} {_how_to_continue(run.path)}")
-    if not run.has_material:
-        notes.append("No stage has estimated material and light yet; only the geometry is shown.")
-    if not run.capture.hdr:
-        notes.append(
-            "The photographs contain display values (LDR): values brighter than white are clipped, so light "
-            "and metallic are underestimated."
-        )
-    if not run.capture.test_views:
-        notes.append(
-            "No view is held out for testing, so the quality of new views is not measured. To measure it, "
-            "train with --test-every 8."
-        )
     light = (
         light_summary(run.config.light, read_fits(run.path, run.step))
         if run.has_material
         else "no light has been estimated yet"
     )
     sections = [
-        ("health", "Health", tables.health_section(files.findings, notes)),
-        ("views", "Views", pictures.views_section(views, bool(run.capture.test_views))),
-        ("surface", "Surface", pictures.surface_section(surface, reason)),
-        ("light", "Light", pictures.light_section(light, picture_of_map(run), lamps_of(run), views.light)),
-        ("figures", "Figures", _figures(run, files, views)),
+        PageSection("health", "Health", tables.health_section(files.findings, list(_notes(run, files)))),
+        PageSection("views", "Views", pictures.views_section(views, bool(run.capture.test_views))),
+        PageSection("surface", "Surface", pictures.surface_section(surface, reason)),
+        PageSection(
+            "light", "Light", pictures.light_section(light, picture_of_map(run), lamps_of(run), views.light)
+        ),
+        PageSection("figures", "Figures", _figures(run, files, views)),
         *_from_files(files),
-        ("reading", "How to read this", tables.reading_section()),
-        ("facts", "Setup", tables.facts_section({"Capture": run.capture.summary, **_facts(files)})),
+        PageSection("reading", "How to read this", tables.reading_section()),
+        PageSection(
+            "facts", "Setup", tables.facts_section({"Capture": run.capture.summary, **_facts(files)})
+        ),
     ]
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"
     return page(title, f"step {run.step} of {files.steps}", sections)
 
 
+def _notes(run: Run, files: Files) -> Iterator[str]:
+    """What the reader should know first: what is missing in the run or its capture, and damaged files."""
+    if run.step < files.steps:
+        stopped = f"Training was stopped after step {run.step} of {files.steps}."
+        yield f"{stopped} {_how_to_continue(run.path)}"
+    yield from files.notes
+    if not run.has_material:
+        yield "No stage has estimated material and light yet; only the geometry is shown."
+    if not run.capture.hdr:
+        yield (
+            "The photographs contain display values (LDR): values brighter than white are clipped, so light "
+            "and metallic are underestimated."
+        )
+    if not run.capture.test_views:
+        yield (
+            "No view is held out for testing, so the quality of new views is not measured. To measure it, "
+            "train with --test-every 8."
+        )
+
+
 def _without_model(files: Files) -> str:
     note = f"{BEFORE_CHECKPOINT}. {_how_to_continue(files.path)}"
     sections = [
-        ("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
+        PageSection("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
         *_from_files(files),
-        ("facts", "Setup", tables.facts_section(_facts(files))),
+        PageSection("facts", "Setup", tables.facts_section(_facts(files))),
     ]
     return page(f"{files.path.resolve().name}, {files.config.preset}", f"step 0 of {files.steps}", sections)
 
@@ -158,12 +166,14 @@ def _how_to_continue(path: Path) -> str:
     return f"To continue: neilfpp train --out {path} --resume"
 
 
-def _from_files(files: Files) -> list[tuple[str, str, Html]]:
+def _from_files(files: Files) -> list[PageSection]:
     settings = tables.settings_section(files.config.preset, changed_settings(files.config))
     return [
-        ("time", "Time", tables.time_section(files.timing, files.work, files.checks, _previews(files.path))),
-        ("effects", "Effects", tables.effects_section(files.effects)),
-        ("settings", "Settings", settings),
+        PageSection(
+            "time", "Time", tables.time_section(files.timing, files.work, files.checks, _previews(files.path))
+        ),
+        PageSection("effects", "Effects", tables.effects_section(files.effects)),
+        PageSection("settings", "Settings", settings),
     ]
 
 

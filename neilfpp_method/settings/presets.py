@@ -189,7 +189,6 @@ BALANCED: Mapping[str, Any] = {
     "encoding.sdf_log2_entries": 19,
     "encoding.max_resolution": 512,
     "volume.samples": 48,
-    "shading.train_samples": 64,
     "shading.eval_samples": 256,
     "light.fit.points": 2048,
     "light.fit.every": 250,
@@ -201,7 +200,7 @@ BALANCED: Mapping[str, Any] = {
 
 
 def balanced() -> NeilfConfig:
-    """`fast` with more steps, more rays and directions, and finer grids.
+    """`fast` with more steps, more rays, finer grids, and more directions in evaluation.
 
     Method and learning rates are the same. docs/budget.md has the time that it takes.
     """

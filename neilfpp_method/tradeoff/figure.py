@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.report.markup import Html, element
+from neilfpp_method.report.svg import svg_text
 from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult
 
 __all__ = ["draw_frontier"]
@@ -63,31 +64,30 @@ def _panel(name: str, points: Sequence[BudgetResult]) -> list[Html]:
         return LEFT + across * (WIDTH - LEFT - RIGHT), TOP + (1 - up) * (HEIGHT - TOP - BOTTOM)
 
     better = "higher" if figure.higher_is_better else "lower"
-    drawn = [_text(LEFT, 18.0, f"{figure.title}, {figure.unit} ({better} is better)", INK, "start")]
+    drawn = [svg_text(LEFT, 18.0, f"{figure.title}, {figure.unit} ({better} is better)", "start", INK)]
     for value in (min(ends), max(ends)):
-        drawn.append(_text(LEFT - 6, place(points[0].seconds, value)[1] + 4, f"{value:.1f}", PALE, "end"))
-    drawn.append(
-        _text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, "time of the runs (logarithmic)", PALE, "middle")
-    )
+        height = place(points[0].seconds, value)[1]
+        drawn.append(svg_text(LEFT - 6, height + 4, f"{value:.1f}", "end", PALE))
+    caption = "time of the runs (logarithmic)"
+    drawn.append(svg_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, caption, "middle", PALE))
     line = [place(point.seconds, point.figures[name]) for point in points]
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in line)
     drawn.append(element("polyline", points=path, fill="none", stroke=LINE, stroke_width=2))
-    for point, (x, y) in zip(points, line, strict=True):
-        deviation = point.deviations.get(name)
-        if deviation is not None:
-            ends_of_bar = (
-                place(point.seconds, point.figures[name] + sign * deviation)[1] for sign in (-1, 1)
-            )
-            bottom, top = (f"{end:.1f}" for end in ends_of_bar)
-            bar = {"x1": f"{x:.1f}", "x2": f"{x:.1f}", "y1": bottom, "y2": top}
-            drawn.append(element("line", **bar, stroke=LINE))
-        fill = "#ffffff" if point.dominated else LINE
-        drawn.append(element("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=4, fill=fill, stroke=LINE))
-        label = f"{format_duration(point.budget)}: {point.figures[name]:.2f}"
-        drawn.append(_text(x, y - 9, label, GRAY if point.dominated else INK, "middle"))
-    return drawn
+    return [*drawn, *(part for point in points for part in _marker(point, name, place))]
 
 
-def _text(x: float, y: float, text: str, color: str, anchor: str) -> Html:
-    place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text_anchor": anchor}
-    return element("text", text, **place, fill=color, font_size=12)
+def _marker(
+    point: BudgetResult, name: str, place: Callable[[float, float], tuple[float, float]]
+) -> Iterator[Html]:
+    """A point with its error bar and label; `place` converts seconds and a value to pixels."""
+    value, deviation = point.figures[name], point.deviations.get(name)
+    x, y = place(point.seconds, value)
+    if deviation is not None:
+        ends = (place(point.seconds, value + sign * deviation)[1] for sign in (-1, 1))
+        bottom, top = (f"{end:.1f}" for end in ends)
+        bar = {"x1": f"{x:.1f}", "x2": f"{x:.1f}", "y1": bottom, "y2": top}
+        yield element("line", **bar, stroke=LINE)
+    fill = "#ffffff" if point.dominated else LINE
+    yield element("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=4, fill=fill, stroke=LINE)
+    label = f"{format_duration(point.budget)}: {value:.2f}"
+    yield svg_text(x, y - 9, label, "middle", GRAY if point.dominated else INK)

@@ -147,6 +147,11 @@ class Run:
         """Whether material and light have been trained; before that they have their initial values."""
         return has_material(self.step, self.config.train)
 
+    @property
+    def device(self) -> torch.device:
+        """Device of the model, on which its points and rays must be."""
+        return next(self.model.parameters()).device
+
 
 def run_folder(path: Path) -> Path:
     """The run folder for a path: the path itself or, for nerfstudio's `config.yml`, the folder next to it.

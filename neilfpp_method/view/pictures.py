@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,18 +89,15 @@ def frames(request: PictureRequest, pace: RenderSpeed) -> Iterator[ViewerFrame |
         total = None
         for sample in range(SAMPLES if traced and share == 1 else 1):
             shader = _path_shader(request, camera, sample) if traced else _layer_shader(request)
-            values = None
-            for values in _render(request, camera, shader, pace, jitter=sample if traced else 0):
-                if values is None:
-                    yield None
+            values = yield from _render(request, camera, shader, pace, jitter=sample if traced else 0)
             total = values if total is None else total + values
             yield _frame(request, camera, total / (sample + 1), share, sample + 1)
 
 
 def _render(
     request: PictureRequest, camera: Camera, shader: Shader, pace: RenderSpeed, jitter: int
-) -> Iterator[Tensor | None]:
-    """Yield None after each batch but the last, then the values of all pixels.
+) -> Generator[None, None, Float[Tensor, "P 4"]]:
+    """Yield None after each batch but the last, and return RGB and opacity of all pixels.
 
     `jitter` seeds the position of the rays within their pixels; 0 stands for the centre.
     """
@@ -122,7 +119,7 @@ def _render(
         start += len(rows)
         if start < len(pixels):
             yield None
-    yield torch.cat(done)
+    return torch.cat(done)
 
 
 def _path_shader(request: PictureRequest, camera: Camera, sample: int) -> Shader:

@@ -48,7 +48,7 @@ class Subject:
     @property
     def device(self) -> torch.device:
         """Device of the model."""
-        return next(self.run.model.parameters()).device
+        return self.run.device
 
     @property
     def layers(self) -> tuple[str, ...]:

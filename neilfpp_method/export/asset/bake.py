@@ -84,7 +84,6 @@ def bake(
         deviation: expected errors at the vertices of `mesh`; None for no such texture.
         on_progress: called with the fraction of the work that is done.
     """
-    device = next(run.model.parameters()).device
     tracer, tangents = first_hits(detail.surface), vertex_tangents(mesh)
     texture = np.zeros((size * size, 8 if deviation is None else 11), np.uint8)
     covered = np.zeros(size * size, bool)
@@ -95,7 +94,7 @@ def bake(
         sign = tangents[mesh.faces[texels.face, 0], 3:]
         unit_normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-12)
         hits = meet_along(detail.surface, tracer, position, unit_normal, detail.reach)
-        points = torch.as_tensor(hits.position, dtype=torch.float32, device=device)
+        points = torch.as_tensor(hits.position, dtype=torch.float32, device=run.device)
         material = materials_in_parts(run, points)
         values = [
             tone_map(material.base_color).cpu().numpy(),

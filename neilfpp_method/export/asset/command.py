@@ -134,6 +134,5 @@ def export_asset(
 
 
 def _points(run: Run, mesh: Unwrapped) -> OrientedPoints:
-    device = next(run.model.parameters()).device
-    parts = (torch.from_numpy(part).float().to(device) for part in (mesh.vertices, mesh.normals))
+    parts = (torch.from_numpy(part).float().to(run.device) for part in (mesh.vertices, mesh.normals))
     return OrientedPoints(*parts)

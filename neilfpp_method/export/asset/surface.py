@@ -59,9 +59,8 @@ def fine_surface(run: Run, resolution: int) -> AssetSurface:
     if isinstance(host, MeshHost):
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
         return AssetSurface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
-    device = next(run.model.parameters()).device
     position, normal = (
-        torch.as_tensor(np.array(a), dtype=torch.float32, device=device)
+        torch.as_tensor(np.array(a), dtype=torch.float32, device=run.device)
         for a in (vertices, mesh.vertex_normals)
     )
     return AssetSurface(vertices, faces, _shading_normals(host, position, normal)[faces])
