@@ -55,6 +55,8 @@ COLUMNS: Mapping[str, Column] = {
     "relight_ssim_scaled": Column("SSIM", 3),
     "volume_psnr": Column("R"),
     "pbr_psnr": Column("PBR"),
+    "volume_psnr_exposed": Column("R, exposed alike"),
+    "pbr_psnr_exposed": Column("PBR, exposed alike"),
     "base_color_psnr": Column("base colour"),
     "base_color_psnr_gamma": Column("base colour, one gamma"),
     "base_color_psnr_scaled": Column("base colour scaled"),
