@@ -9,14 +9,13 @@ the shape contains the object and fills what no camera sees.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float
 from scipy import ndimage
+from torch import Tensor
 
-from neilfpp_method.data.views import Camera, project
+from neilfpp_method.data.views import Camera, pixel_index, project, scaled_camera
 from neilfpp_method.data.visual_hull import (
     MIN_CELLS,
     MIN_SEEN_SHARE,
@@ -65,17 +64,19 @@ def find_cloud_hull(
         >>> hull if isinstance(hull, str) else hull.at(points.position)  # about 0
     """
     cell = 2 * radius / resolution
-    centers = cell_centers(radius, resolution)
+    centers = torch.from_numpy(cell_centers(radius, resolution))
+    points = points.to("cpu")
     # A corner of the cube is seen by few views, all of them from behind the object.
-    in_ball = np.linalg.norm(centers, axis=1) < radius + MARGIN * cell
-    views, hidden, empty = (np.zeros(len(centers), np.int32) for _ in range(3))
+    in_ball = centers.norm(dim=-1) < radius + MARGIN * cell
+    views, hidden, empty = torch.zeros(3, len(centers))
     for camera in cameras:
-        depth = _depth_map(camera, points)
-        cells = _pixels(camera, centers, depth.shape)
-        in_image = cells.index >= 0
-        first = np.where(in_image, depth.ravel()[cells.index], np.inf)
-        in_front = cells.depth < first - TOLERANCE * cell
-        known = np.isfinite(first)
+        camera = _reduced(camera)
+        projected = project(camera, centers)
+        index = pixel_index(projected, camera)
+        in_image = index >= 0
+        first = torch.where(in_image, _depth_map(camera, points).flatten()[index], torch.inf)
+        in_front = projected.depth < first - TOLERANCE * cell
+        known = first.isfinite()
         views += in_image
         empty += known & in_front
         hidden += known & ~in_front
@@ -84,43 +85,23 @@ def find_cloud_hull(
     solid = in_ball & enough_views & hides
     if solid.sum() < MIN_CELLS:
         return "the point cloud hides almost nothing from the cameras"
-    cube = solid.reshape(resolution, resolution, resolution)
+    cube = solid.numpy().reshape(resolution, resolution, resolution)
     return DistanceCube(torch.from_numpy(signed_distance(cube, cell)), radius)
 
 
-def _depth_map(camera: Camera, points: OrientedPoints) -> Float64[np.ndarray, "H W"]:
-    """Depth of the first point that faces the camera in or near each pixel; infinite where there is none."""
+def _reduced(camera: Camera) -> Camera:
+    """The camera with the size of a depth map."""
     factor = DEPTH_SIDE / max(camera.width, camera.height)
-    shape = max(1, round(factor * camera.height)), max(1, round(factor * camera.width))
-    position, normal = points.position.double().cpu().numpy(), points.normal.double().cpu().numpy()
-    facing = ((camera.c2w[:, 3] - position) * normal).sum(axis=1) > 0
-    seen = _pixels(camera, position[facing], shape)
-    in_image = seen.index >= 0
-    first = np.full(shape[0] * shape[1], np.inf)
-    np.minimum.at(first, seen.index[in_image], seen.depth[in_image])
-    return ndimage.minimum_filter(first.reshape(shape), 2 * GAP + 1)
+    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+    return scaled_camera(camera, width, height)
 
 
-@dataclass(frozen=True)
-class _Pixels:
-    """Where a camera sees P points.
-
-    Attributes:
-        index: number of the pixel, row by row; −1 if the point is not in the image.
-        depth: distance along the optical axis.
-    """
-
-    index: Int64[np.ndarray, " P"]
-    depth: Float64[np.ndarray, " P"]
-
-
-def _pixels(camera: Camera, points: Float64[np.ndarray, "P 3"], shape: tuple[int, int]) -> _Pixels:
-    """The pixels of points in an image of another size (rows, columns) with the same field of view."""
-    height, width = shape
-    projected = project(camera, torch.from_numpy(points))
-    across, down = (projected.pixel.numpy() * [width / camera.width, height / camera.height]).T
-    depth = projected.depth.numpy()
-    with np.errstate(invalid="ignore"):
-        visible = (depth > 0) & (across >= 0) & (across < width) & (down >= 0) & (down < height)
-    column, row = (np.where(visible, place, 0).astype(np.int64) for place in (across, down))
-    return _Pixels(np.where(visible, row * width + column, -1), depth)
+def _depth_map(camera: Camera, points: OrientedPoints) -> Float[Tensor, "H W"]:
+    """Depth of the first point that faces the camera in or near each pixel; infinite where there is none."""
+    to_camera = torch.from_numpy(camera.c2w[:, 3]).to(points.position) - points.position
+    projected = project(camera, points.position[(to_camera * points.normal).sum(-1) > 0])
+    index = pixel_index(projected, camera)
+    first = projected.depth.new_full((camera.height * camera.width,), torch.inf)
+    first.scatter_reduce_(0, index[index >= 0], projected.depth[index >= 0], "amin")
+    covered = ndimage.minimum_filter(first.view(camera.height, camera.width).numpy(), 2 * GAP + 1)
+    return torch.from_numpy(covered)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Shaped
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.views import Camera, View
+from neilfpp_method.data.views import View, scaled_camera
 from neilfpp_method.errors import UserError
 
 __all__ = [
@@ -30,7 +30,6 @@ __all__ = [
     "scale_for_pixels",
     "scale_for_rays",
     "scale_for_width",
-    "scaled_camera",
     "scaled_view",
 ]
 
@@ -46,26 +45,6 @@ MIN_REDUCING_SCALE = 0.98
 def file_size(view: View) -> tuple[int, int]:
     """Return width and height of the files of a view, in pixels."""
     return view.file_size or (view.camera.width, view.camera.height)
-
-
-def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Return the camera with the same field of view and another number of pixels.
-
-    >>> camera = Camera(500.0, 500.0, 200.0, 150.0, 400, 300, np.eye(4))
-    >>> half = scaled_camera(camera, 200, 150)
-    >>> half.fx, half.cx, half.cy
-    (250.0, 100.0, 75.0)
-    """
-    right, down = width / camera.width, height / camera.height
-    return replace(
-        camera,
-        fx=camera.fx * right,
-        fy=camera.fy * down,
-        cx=camera.cx * right,
-        cy=camera.cy * down,
-        width=width,
-        height=height,
-    )
 
 
 def scaled_view(view: View, scale: float) -> View:

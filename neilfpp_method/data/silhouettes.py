@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 
 from neilfpp_method.data.images import read_image
-from neilfpp_method.data.views import Camera, View, project
+from neilfpp_method.data.views import View, pixel_index, project, scaled_camera
 
 __all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "SilhouetteCounts", "agreement", "read_outlines", "sightings"]
 
@@ -63,14 +63,7 @@ def _outline(view: View, mask: Bool[np.ndarray, "H W"], longest: int) -> Outline
     if factor < 1:
         height, width = (max(1, round(factor * side)) for side in mask.shape)
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
-    return Outline(replace(view, camera=_of_size(view.camera, *mask.shape)), mask)
-
-
-def _of_size(camera: Camera, height: int, width: int) -> Camera:
-    """The camera with the same field of view and another number of pixels."""
-    across, down = width / camera.width, height / camera.height
-    focal = {"fx": across * camera.fx, "fy": down * camera.fy}
-    return replace(camera, **focal, cx=across * camera.cx, cy=down * camera.cy, width=width, height=height)
+    return Outline(replace(view, camera=scaled_camera(view.camera, *mask.shape[::-1])), mask)
 
 
 @dataclass(frozen=True)
@@ -86,16 +79,10 @@ def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -
     visible_in, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for outline in outlines:
         camera = outline.view.camera
-        image = project(camera, torch.from_numpy(points))
-        pixel, depth = (
-            np.nan_to_num(image.pixel.numpy(), nan=-1.0, posinf=-1.0, neginf=-1.0),
-            image.depth.numpy(),
-        )
-        size = np.array([camera.width, camera.height])
-        in_image = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
-        column, row = np.where(in_image[:, None], pixel, 0).astype(np.int64).T
+        index = pixel_index(project(camera, torch.from_numpy(points)), camera).numpy()
+        in_image = index >= 0
         visible_in += in_image | outline.complete
-        inside += in_image & outline.inside[row, column]
+        inside += in_image & outline.inside.ravel()[index]
     return SilhouetteCounts(visible_in, inside)
 
 

@@ -32,8 +32,10 @@ __all__ = [
     "camera_rays",
     "check_camera",
     "inside",
+    "pixel_index",
     "plain_name",
     "project",
+    "scaled_camera",
 ]
 
 MAX_BLIND_SHARE = 0.6
@@ -75,6 +77,26 @@ class Camera:
         """Camera to world: the transposed rotation, with the camera's centre as the last column."""
         rotation = self.w2c[:3, :3].T
         return np.concatenate([rotation, -rotation @ self.w2c[:3, 3:]], axis=1)
+
+
+def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Return the camera with the same field of view and another number of pixels.
+
+    >>> camera = Camera(500.0, 500.0, 200.0, 150.0, 400, 300, np.eye(4))
+    >>> half = scaled_camera(camera, 200, 150)
+    >>> half.fx, half.cx, half.cy
+    (250.0, 100.0, 75.0)
+    """
+    right, down = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        fx=camera.fx * right,
+        fy=camera.fy * down,
+        cx=camera.cx * right,
+        cy=camera.cy * down,
+        width=width,
+        height=height,
+    )
 
 
 def check_camera(camera: Camera, where: str) -> None:
@@ -245,6 +267,14 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> Projection:
     if camera.lens is not None:
         plane = torch.as_tensor(camera.lens.bend(plane.detach().cpu().double().numpy())).to(plane)
     return Projection(plane * intrinsics[:2] + intrinsics[2:], depth)
+
+
+def pixel_index(projected: Projection, camera: Camera) -> Int[Tensor, " N"]:
+    """Row-major index of the pixel that each projected point falls in; −1 outside of the image."""
+    size = projected.pixel.new_tensor([camera.width, camera.height])
+    inside = (projected.depth > 0) & ((projected.pixel >= 0) & (projected.pixel < size)).all(-1)
+    column, row = torch.where(inside[:, None], projected.pixel, 0.0).long().unbind(-1)
+    return torch.where(inside, row * camera.width + column, -1)
 
 
 def camera_rays(camera: Camera, dtype: torch.dtype = torch.float32) -> RayBatch:

@@ -113,7 +113,7 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
         The initial light; None if there are fewer than `MIN_PLACES` places.
     """
     places = data.places
-    if places.shown < MIN_PLACES:
+    if places.shown_count < MIN_PLACES:
         return None
     split = data.hold_back(0, FOLDS)
     fits = {FIRST_SCALE: fit_places(split.known, Permitted(metals, FIRST_SCALE))}
@@ -141,7 +141,7 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
         mean=mean,
         errors=errors,
         scale=scale,
-        places=places.shown,
+        places=places.shown_count,
         observed=places.observed[drawn],
         material=Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic),
         lamp_trial=LampTrial(split, fit_on),

@@ -99,7 +99,7 @@ def best_materials(
     arriving: Float[Tensor, "K N 3"],
     places: Places,
     typical: float,
-    metallics: tuple[float, ...],
+    metallics: range,
     near: Int[Tensor, "P M"],
 ) -> BestMaterials:
     """Choose the material of each place from all pairs of the grids, under a fixed light.
@@ -112,7 +112,7 @@ def best_materials(
         arriving: the parts of outgoing radiance under the light (`lighting.layered_transport`).
         places: the places with their pixels, in linear radiance.
         typical: radiance of a typical pixel.
-        metallics: values of metallic that are tried, the first ones of `METALLICS`.
+        metallics: indices in `METALLICS` of the values that are tried.
         near: indices of the neighbours of each place, including itself (`neighbors`).
     """
     diffuse, unit = arriving[0], places.observed.pixel + FLOOR * typical
@@ -121,7 +121,8 @@ def best_materials(
     best = BestMaterials(base_color, first, first, torch.full_like(base_color[:, 0], torch.inf))
     for k in range(len(ROUGHNESSES)):
         facing, grazing = arriving[1 + 2 * k], arriving[2 + 2 * k]
-        for j, m in enumerate(metallics):
+        for j in metallics:
+            m = METALLICS[j]
             # The relative error of a pixel is base_color · slope − target.
             slope = ((1 - m) * diffuse + m * facing) / unit
             target = (places.observed.pixel - 0.04 * (1 - m) * facing - grazing) / unit

@@ -147,8 +147,11 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     look = COLOR_SCALE * current.base_color.clamp_min(MIN_BASE_COLOR).log()
     near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
     loss = _loss_of(current, arriving, places, typical, near)
-    best = best_materials(arriving, places, typical, METALLICS, near)
-    paint = best_materials(arriving, places, typical, METALLICS[:1], near)
+    paint, metal = (
+        best_materials(arriving, places, typical, metallics, near)
+        for metallics in (range(1), range(1, len(METALLICS)))
+    )
+    best = metal.where(metal.loss < paint.loss, paint)
     roughness = current.roughness[:, 0]
     is_matte = (roughness >= MATTE_ROUGHNESS) & (paint.loss < MATTE_RATIO * best.loss)
     found = best.where(~is_matte, paint)

@@ -105,7 +105,7 @@ class PlaceSolver(nn.Module):
         If there are too few places, the first fit starts from an even light.
         """
         places = self.places()
-        if model.lobe is None or places.shown < MIN_PLACES:
+        if model.lobe is None or places.shown_count < MIN_PLACES:
             return
         rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
         self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")

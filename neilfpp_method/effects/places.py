@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.views import project
+from neilfpp_method.data.views import pixel_index, project
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.lighting.layered_transport import SharedPoints
 from neilfpp_method.model import NeilfModel
@@ -49,7 +49,7 @@ class Places:
     observed: Observed
 
     @property
-    def shown(self) -> int:
+    def shown_count(self) -> int:
         """Number of places that have pixels."""
         return len(self.place.unique())
 
@@ -120,13 +120,12 @@ def _in_view(
     """The pixels of one view that show the chosen points; None if none of these lies in the image."""
     camera = pixels.capture.scene_camera(pixels.views[number])
     projected = project(camera, points.position)
-    column, row = projected.pixel.floor().long().unbind(-1)
-    within = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    place = torch.nonzero(within & (projected.depth > 0) & is_chosen)[:, 0]
+    index = pixel_index(projected, camera)
+    place = torch.nonzero((index >= 0) & is_chosen)[:, 0]
     if not len(place):
         return None
     position, normal = points.position[place], points.normal[place]
-    pixel = row[place] * camera.width + column[place]
+    pixel = index[place]
     batch = pixels.at(number, pixel)
     hits = model.host.render(batch.rays)
     distance = (hits.position - position).norm(dim=-1)

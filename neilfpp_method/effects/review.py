@@ -132,7 +132,7 @@ def review_light(
     if most < MIN_PIXELS:
         return _not_measured(plan, step, "the budget leaves no time for it")
     places = light_places(model, pixels, most)
-    if places.shown < MIN_PLACES:
+    if places.shown_count < MIN_PLACES:
         return _not_measured(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
     with model.evaluating():
         return _review_light_at(places, plan, model, step)
@@ -174,7 +174,7 @@ def improve_material(model: NeilfModel, places: Places) -> str | None:
     Returns:
         One line for the console; None if there are fewer than `MIN_PLACES` places.
     """
-    if places.shown < MIN_PLACES:
+    if places.shown_count < MIN_PLACES:
         return None
     searched = search_materials(model, places)
     if searched.share > 0:

@@ -6,17 +6,17 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.views import Camera, Projection, project
+from neilfpp_method.data.views import pixel_index, project
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
-__all__ = ["Sightings", "TrainingViews", "pixel_index"]
+__all__ = ["Sightings", "TrainingViews"]
 
 TOLERANCE = 0.05
 """Distance, scene units, within which two surface points count as the same; that of the hit criterion."""
@@ -118,14 +118,6 @@ def _unoccluded(
         hits = model.host.render(RayBatch(center.expand(len(rows), 3), -direction[rows]))
         unoccluded[rows] = hits.is_hit(share) & ((hits.position - position[rows]).norm(dim=-1) <= TOLERANCE)
     return unoccluded
-
-
-def pixel_index(projected: Projection, camera: Camera) -> Int[Tensor, " N"]:
-    """Row-major index of the pixel that each projected point falls in; −1 outside of the image."""
-    size = projected.pixel.new_tensor([camera.width, camera.height])
-    inside = (projected.depth > 0) & ((projected.pixel >= 0) & (projected.pixel < size)).all(-1)
-    column, row = torch.where(inside[:, None], projected.pixel, 0.0).long().unbind(-1)
-    return torch.where(inside, row * camera.width + column, -1)
 
 
 def _farthest_first(centers: Float[Tensor, "C 3"]) -> list[int]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.views import Camera, View
+from neilfpp_method.data.views import Camera, View, scaled_camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch
 
@@ -110,7 +110,7 @@ def turntable(capture: Capture, frames: int, scale: float | None, width: int | N
 
 
 def resized(camera: Camera, factor: float) -> Camera:
-    """Return the camera with another image size. A lens distorts the unit plane and does not change.
+    """`scaled_camera` with the size multiplied by a factor.
 
     Raises:
         UserError: width or height is not within 1 … 8192 pixels.
@@ -121,9 +121,7 @@ def resized(camera: Camera, factor: float) -> Camera:
             f"an image cannot have {width}×{height} pixels",
             f"choose --scale or --width for 1 to {MAX_SIDE} pixels per side",
         )
-    x, y = width / camera.width, height / camera.height
-    sizes = {"fx": camera.fx * x, "cx": camera.cx * x, "fy": camera.fy * y, "cy": camera.cy * y}
-    return replace(camera, **sizes, width=width, height=height)
+    return scaled_camera(camera, width, height)
 
 
 @dataclass(frozen=True)

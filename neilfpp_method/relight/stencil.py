@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import image_header, read_image
-from neilfpp_method.data.views import Camera, project
+from neilfpp_method.data.views import Camera, pixel_index, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.cameras import resized
 from neilfpp_method.relight.edits import Limit
@@ -36,13 +36,9 @@ class Stencil:
 
     def covers(self, x: Float[Tensor, "N 3"], surface: Surface) -> Bool[Tensor, "N 1"]:
         """Whether the camera sees points through a white pixel, without occlusion by the surface."""
-        projected = project(self.camera, x)
-        column, row = projected.pixel.nan_to_num(-1.0, -1.0, -1.0).floor().long().unbind(-1)
-        height, width = self.white.shape
-        inside = (projected.depth > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        covered = torch.zeros_like(inside)
-        rows = torch.nonzero(inside)[:, 0]
-        rows = rows[self.white.to(x.device)[row[rows], column[rows]]]
+        index = pixel_index(project(self.camera, x), self.camera)
+        covered = (index >= 0) & self.white.to(x.device).flatten()[index]
+        rows = torch.nonzero(covered)[:, 0]
         eye = torch.as_tensor(self.camera.c2w[:, 3], dtype=x.dtype, device=x.device)
         offset = x[rows] - eye
         distance = offset.norm(dim=-1)

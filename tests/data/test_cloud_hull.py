@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
@@ -102,4 +101,4 @@ def test_a_point_hides_only_what_its_front_faces():
     middle = tuple(side // 2 for side in outside.shape)
     assert outside[middle] == pytest.approx(4 - BALL, abs=0.02)
     assert inside[middle] == pytest.approx(4 + BALL, abs=0.06)
-    assert np.isinf(outside[0, 0])
+    assert outside[0, 0].isinf()

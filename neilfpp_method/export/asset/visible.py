@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from neilfpp_method.data.views import Camera, CameraRays, project
+from neilfpp_method.data.views import Camera, CameraRays, pixel_index, project
 from neilfpp_method.export.asset.surface import AssetSurface, first_hits
 
 __all__ = ["visible_faces"]
@@ -52,9 +52,7 @@ def visible_faces(surface: AssetSurface, cameras: Sequence[Camera]) -> Bool[np.n
     for camera in cameras:
         eye = torch.from_numpy(camera.c2w[:, 3]).float()
         rows = torch.nonzero(~visible & (((eye - center) * outward).sum(-1) > 0))[:, 0]
-        projected = project(camera, center[rows])
-        size = projected.pixel.new_tensor([camera.width, camera.height])
-        in_image = (projected.depth > 0) & ((projected.pixel >= 0) & (projected.pixel < size)).all(-1)
+        in_image = pixel_index(project(camera, center[rows]), camera) >= 0
         for part in rows[in_image].split(RAYS_AT_ONCE):
             direction = center[part] - eye
             face = tracer(eye.expand_as(direction), torch.nn.functional.normalize(direction, dim=-1))
