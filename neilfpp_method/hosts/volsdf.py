@@ -288,6 +288,9 @@ class VolSdfHost(nn.Module):
         distances = self._sample(rays, interval, volume)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
+        if surface.distance.requires_grad:
+            # A step may follow, and the fused optimizers do not count the versions of parameters.
+            self._evaluation_space = None
         weights = depth_weights(self.density(surface.distance.reshape(distances.shape), distances))
         normals = safe_normalize(surface.gradient)
         wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -11,8 +11,15 @@ from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.tradeoff.files import write_tradeoff
-from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult, frontier
-from neilfpp_method.tradeoff.rows import TradeoffRequest, check_same, measured, rows_of, run_row
+from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult, RunResult, frontier
+from neilfpp_method.tradeoff.rows import (
+    PlannedRun,
+    TradeoffRequest,
+    check_same,
+    measured,
+    rows_of,
+    run_row,
+)
 from neilfpp_method.train.output import check_folder
 
 __all__ = ["run_tradeoff"]
@@ -23,8 +30,8 @@ def run_tradeoff(
 ) -> list[BudgetResult]:
     """Train and evaluate all runs that are not finished, one after the other, and write the frontier.
 
-    The files are written again after each run. A budget that is too small for this machine is reported,
-    skipped, and tried again by the next call.
+    The files are written again after each run. A run that cannot be made or measured is reported, left out,
+    and tried again by the next call: its budget may be too small for this machine, or it found no surface.
 
     Args:
         request: the runs.
@@ -45,27 +52,31 @@ def run_tradeoff(
     check_folder(out)
     for row in rows:
         check_same(row)
-    refused = ""
+    left_out: dict[str, str] = {}
     for number, row in enumerate(rows, start=1):
         console.print(f"run {number} of {len(rows)}: {row.name}", soft_wrap=True)
         try:
             run_row(row, console, at_end)
         except UserError as error:
-            if (row.out / "config.json").is_file():
-                raise
-            refused = str(error)
-            console.print(f"skipped: {refused}", style="yellow", soft_wrap=True)
+            left_out[row.name] = str(error)
+            console.print(f"left out: {error}", style="yellow", soft_wrap=True)
             continue
-        runs = [result for result in map(measured, rows) if result is not None]
-        write_tradeoff(out, f"{request.data.resolve().name}, {request.config.preset}", runs)
-    runs = [result for result in map(measured, rows) if result is not None]
+        title = f"{request.data.resolve().name}, {request.config.preset}"
+        write_tradeoff(out, title, finished_runs(rows, left_out))
+    runs = finished_runs(rows, left_out)
     if not runs:
-        raise UserError(f"{out}: no run could be made", refused)
+        raise UserError(f"{out}: no run could be made", list(left_out.values())[-1])
     points = frontier(runs)
     for line in frontier_table(points):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg", soft_wrap=True)
     return points
+
+
+def finished_runs(rows: Sequence[PlannedRun], left_out: Collection[str]) -> list[RunResult]:
+    """The results of the finished runs, without those of the given names."""
+    results = (measured(row) for row in rows if row.name not in left_out)
+    return [result for result in results if result is not None]
 
 
 def frontier_table(points: Sequence[BudgetResult]) -> list[str]:

@@ -71,6 +71,25 @@ def test_images_follow_a_field_that_changes():
     assert ((after > 0.5) == (whole > 0.5)).float().mean() > 0.98
 
 
+@pytest.mark.parametrize("fused", [True, False])
+def test_images_follow_a_field_that_is_trained(fused):
+    """The fused optimizers change parameters without counting it in their versions."""
+    training = host().train()
+    training.density.above_floor.data.fill_(2e-3)
+    rays = sphere_batch(200, spread=1.2).rays
+    with torch.no_grad():
+        before = training.eval().render(rays).opacity
+    bias = training.sdf_field.mlp.layers[-1].bias
+    optimizer = torch.optim.Adam([bias], lr=0.3, fused=fused)
+    training.train().render_regularized(sphere_batch(), ())
+    bias.grad = torch.ones_like(bias)
+    optimizer.step()  # distances become smaller: the sphere grows
+    with torch.no_grad():
+        after, whole = training.eval().render(rays).opacity, training._march(rays).hits.opacity
+    assert (before > 0.5).sum() + 10 < (after > 0.5).sum()
+    assert ((after > 0.5) == (whole > 0.5)).float().mean() > 0.98
+
+
 def test_evaluation_with_gradients_samples_whole_rays():
     skipping, plain = host().eval(), host(skip=False).eval()
     plain.load_state_dict(skipping.state_dict(), strict=False)

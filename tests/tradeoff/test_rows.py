@@ -1,5 +1,5 @@
 """Rows of a tradeoff are runs: finished ones are kept, stopped ones continue, and budgets that are too small
-are skipped.
+are left out.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings import presets
 from neilfpp_method.settings.plain import changed
+from neilfpp_method.tradeoff import rows
 from neilfpp_method.tradeoff.rows import TradeoffRequest, rows_of
 from neilfpp_method.train.budget_record import read_budget
 from tests.data.make_capture import make_capture
@@ -37,7 +38,7 @@ def test_a_second_call_continues_and_repeats_nothing(tmp_path, words, clock, mon
     with monkeypatch.context() as patch:
         interrupt_at(patch, 12)
         assert main(words) == 130  # in the row of 2m, as that of 1s is too small
-    assert "skipped: a budget of 1s is too small" in capsys.readouterr().out
+    assert "left out: a budget of 1s is too small" in capsys.readouterr().out
     assert read_budget(out / "2m-seed0").took is None
     # `neilfpp eval` has measured the stopped run.
     (out / "2m-seed0" / "metrics.json").write_text('{"pbr_psnr": 99.0}')
@@ -56,6 +57,23 @@ def test_a_second_call_continues_and_repeats_nothing(tmp_path, words, clock, mon
 
     assert main([*words, "--host", "mesh"]) == 2
     assert "another capture or with other settings" in capsys.readouterr().err
+
+
+def test_a_run_that_cannot_be_measured_is_left_out(tmp_path, words, clock, monkeypatch, capsys):
+    """A run without a surface fails in evaluation; the others still make a frontier."""
+    measure = rows.evaluate
+
+    def fails_for_2m(run):
+        if run.path.name == "2m-seed0":
+            raise UserError("no surface within 3 scene units", "train for longer")
+        return measure(run)
+
+    monkeypatch.setattr(rows, "evaluate", fails_for_2m)
+    assert main([*words, "--budgets", "2m,3m"]) == 0
+    assert "left out: no surface within 3 scene units" in capsys.readouterr().out
+    points = json.loads((tmp_path / "out" / "tradeoff.json").read_text())["points"]
+    assert [point["budget"] for point in points] == [180.0]
+    assert "pbr_psnr" in points[0]["figures"]
 
 
 def test_a_row_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, clock, monkeypatch, capsys):

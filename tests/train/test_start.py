@@ -108,16 +108,19 @@ def test_the_start_depends_on_the_seed_and_keeps_the_random_state(masked):
     assert torch.equal(torch.get_rng_state(), state), "training draws the same whatever it started as"
 
 
-@pytest.mark.parametrize(("shape", "share", "waiting"), [
-    ("hull", 0.0, {"geometry", "beta"}),
-    ("hull", 0.09, {"geometry", "beta"}),
-    ("hull", 0.1, set()),
-    ("sphere", 0.0, set()),
+@pytest.mark.parametrize(("shape", "step", "length", "waiting"), [
+    ("hull", 99, 1000, {"geometry", "beta"}),
+    ("hull", 100, 1000, set()),
+    ("hull", 59, 200, {"geometry", "beta"}),
+    ("hull", 60, 200, set()),
+    ("hull", 19, 40, {"geometry", "beta"}),
+    ("hull", 20, 40, set()),
+    ("sphere", 0, 1000, set()),
 ])  # fmt: skip
-def test_geometry_waits_for_radiance_if_it_starts_from_the_hull(masked, shape, share, waiting):
+def test_geometry_waits_for_radiance_if_it_starts_from_the_hull(masked, shape, step, length, waiting):
     model, _ = started(masked, settings(shape))
     optimizer = model.config.optimizer
-    at = StagePosition(Stage.SDF_INIT, round(100 * share), 100)
+    at = StagePosition(Stage.SDF_INIT, step, length)
     assert waiting_fields(model, optimizer, at) - {"background"} == waiting
     assert waiting_fields(model, optimizer, StagePosition(Stage.JOINT, 0, 100)) == set()
     resumed = VolSdfHost(model.config, model.facts)
