@@ -1,4 +1,4 @@
-"""The tables of results, performance, hosts and relighting in docs/, from the files in benchmarks/results.
+"""The tables of the documents (`NAMES`), from the files in benchmarks/results.
 
     python -m benchmarks.tables            write the tables into the documents
     python -m benchmarks.tables --check    exit status 1 where a document is not what the result files say
@@ -32,7 +32,7 @@ __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "wr
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "results"
-NAMES = ("results.md", "performance.md", "confidence.md", "hosts.md", "relighting.md")
+NAMES = ("results.md", "performance.md", "budget.md", "confidence.md", "hosts.md", "relighting.md")
 DOCUMENTS = tuple(ROOT / "docs" / name for name in NAMES)
 FORMAT = 1
 MARKED = re.compile(r"(<!-- table: ([\w-]+)((?: \w+)*) -->\n).*?(<!-- end -->)", re.DOTALL)
