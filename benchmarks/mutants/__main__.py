@@ -19,21 +19,21 @@ from benchmarks.mutants.table import table, write_table
 
 
 def main(write: bool = False, only: str = "") -> int:
-    """Plant faults one at a time, and say which quick test notices each.
+    """Plant faults one at a time, and print which quick test notices each.
 
     Args:
-        write: put the table into docs/stability.md; rows of faults that were not planted stay as they are.
-        only: those whose module, or description, has this in it.
+        write: put the table into docs/stability.md; rows of faults that were not planted are left unchanged.
+        only: plant only faults whose module or description contains this text.
     """
     chosen = [mutant for mutant in MUTANTS if only in mutant.module or only in mutant.what]
-    verdicts = try_all(
+    outcomes = try_all(
         chosen, lambda v: print(f"{v.mutant.what}: {v.noticed_by or 'NOT NOTICED'}", flush=True)
     )
-    caught = sum(verdict.noticed_by is not None for verdict in verdicts)
-    print(f"\n{table(verdicts)}\n{caught} of {len(verdicts)} faults are noticed")
+    caught = sum(outcome.noticed_by is not None for outcome in outcomes)
+    print(f"\n{table(outcomes)}\n{caught} of {len(outcomes)} faults are noticed")
     if write:
-        write_table(verdicts)
-    return int(caught < len(verdicts))
+        write_table(outcomes)
+    return int(caught < len(outcomes))
 
 
 if __name__ == "__main__":

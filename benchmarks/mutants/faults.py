@@ -1,4 +1,4 @@
-"""The faults: each changes one place of one module."""
+"""The faults: each changes one place in one module."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ __all__ = ["MUTANTS", "Mutant"]
 
 @dataclass(frozen=True)
 class Mutant:
-    """A fault: in a module of the package `old`, which stands there once, becomes `new`.
+    """A fault in a module of the package.
 
     Attributes:
         what: the fault in a few words.
-        module: path below the package.
-        tests: path below `tests` of what should notice it.
+        module: path of the module below the package.
+        old: the code that the fault replaces; it occurs exactly once in the module.
+        new: the code with the fault.
+        tests: path below `tests` of the tests that should notice it.
     """
 
     what: str
@@ -36,7 +38,7 @@ MUTANTS: Sequence[Mutant] = (
         "shading/test_rendering_equation.py",
     ),
     Mutant(
-        "light from below the horizon counts",
+        "light from below the horizon is added",
         "shading/rendering_equation.py",
         "dot(incident.wi, n).clamp_min(0) * incident.weight",
         "dot(incident.wi, n) * incident.weight",
@@ -44,14 +46,14 @@ MUTANTS: Sequence[Mutant] = (
     ),
     Mutant("Fresnel's power is 4", BRDF, "(1 - cos.d).pow(5)", "(1 - cos.d).pow(4)", "shading/test_brdf.py"),
     Mutant(
-        "Fresnel is not taken off the facing part",
+        "the part without Fresnel is not reduced by the Fresnel part",
         BRDF,
         "SpecularTerms(reflected - grazing, grazing)",
         "SpecularTerms(reflected, grazing)",
         "shading/test_brdf.py",
     ),
     Mutant(
-        "metals keep their diffuse part",
+        "metals reflect diffusely",
         BRDF,
         "base_color * (1 - material.metallic) if specular",
         "base_color if specular",
@@ -65,7 +67,7 @@ MUTANTS: Sequence[Mutant] = (
         "shading/test_brdf.py",
     ),
     Mutant(
-        "no floor of the roughness",
+        "the roughness of a lobe has no lower bound",
         BRDF,
         "wide.clamp_min(roughness_floor(wide.dtype)).square()",
         "wide.square()",
@@ -79,14 +81,14 @@ MUTANTS: Sequence[Mutant] = (
         "shading/test_brdf.py",
     ),
     Mutant(
-        "half vector opposite to the light",
+        "the half vector points away from the light",
         BRDF,
         "((1 + dot(wi, wo)) / 2)",
         "((1 - dot(wi, wo)) / 2)",
         "shading/test_brdf.py",
     ),
     Mutant(
-        "no half vector, no floor",
+        "the cosine between `wo` and the half vector can be 0",
         BRDF,
         ".clamp(1e-8, 1).sqrt()",
         ".clamp(0, 1).sqrt()",
@@ -100,14 +102,14 @@ MUTANTS: Sequence[Mutant] = (
         "shading/test_color.py",
     ),
     Mutant(
-        "left-handed frame",
+        "the local frame is left-handed",
         "shading/frame.py",
         "torch.stack((tangent, bitangent, n), -2)",
         "torch.stack((bitangent, tangent, n), -2)",
         "shading/test_frame.py",
     ),
     Mutant(
-        "normals of no length divide by 0",
+        "a normal of length 0 divides by 0",
         "shading/frame.py",
         "torch.where(long_enough, squared, 1.0).sqrt()",
         "squared.sqrt()",
@@ -115,35 +117,35 @@ MUTANTS: Sequence[Mutant] = (
     ),
     # Sampling.
     Mutant(
-        "density of the lobe without the Jacobian of the half vector",
+        "pdf of the lobe without the Jacobian of the half vector",
         SAMPLING,
         "/ (4 * cos.d)",
         "/ 4",
         "shading/test_sampling.py",
     ),
     Mutant(
-        "density of the cosine sampler per 2π",
+        "pdf of the cosine sampler with 1/(2π)",
         SAMPLING,
         "dot(wi, n).clamp_min(0) / math.pi",
         "dot(wi, n).clamp_min(0) / (2 * math.pi)",
         "shading/test_sampling.py",
     ),
     Mutant(
-        "cosine sampler draws evenly",
+        "the cosine sampler draws uniformly",
         SAMPLING,
         "_hemisphere(n, lambda u: (1 - u).sqrt(), pdf_cosine)",
         "_hemisphere(n, lambda u: 1 - u, pdf_cosine)",
         "shading/test_sampling.py",
     ),
     Mutant(
-        "densities joined without their shares",
+        "pdfs are combined without their shares",
         SAMPLING,
         "technique.pdf(wi) * (count / wi.shape[1])",
         "technique.pdf(wi)",
         "shading/test_sampling.py",
     ),
     Mutant(
-        "strata are not moved",
+        "stratified samples are always midpoints",
         SAMPLING,
         "(k + (torch.rand_like(k) if stochastic else 0.5)) / count",
         "(k + 0.5) / count",
@@ -151,42 +153,42 @@ MUTANTS: Sequence[Mutant] = (
     ),
     # Density and compositing.
     Mutant(
-        "sign of the distance",
+        "the signed distance has the wrong sign",
         "volume/density.py",
         "scaled = sdf / beta\n",
         "scaled = -sdf / beta\n",
         "volume/test_density.py",
     ),
     Mutant(
-        "even cuts divide by 0",
+        "equal distances at both ends of an interval divide by 0",
         "volume/density.py",
         "torch.where(close, torch.ones_like(step), step)",
         "step",
         "volume/test_density.py",
     ),
     Mutant(
-        "β has no floor",
+        "β has no lower bound",
         "volume/density.py",
         "self.above_floor.abs() + self.beta_floor",
         "self.above_floor.abs()",
         "volume/test_density.py",
     ),
     Mutant(
-        "a sample hides itself",
+        "the transmittance of a sample includes its own density",
         "volume/compositing.py",
         "torch.exp(-depth_before[:, :-1])",
         "torch.exp(-depth_before[:, 1:])",
         "volume/test_compositing.py",
     ),
     Mutant(
-        "weights are optical depths",
+        "the weight of a sample is its optical depth",
         "volume/compositing.py",
         "* -torch.expm1(-depth)\n",
         "* depth\n",
         "volume/test_compositing.py",
     ),
     Mutant(
-        "swapped samples emit",
+        "samples in the wrong order have a weight",
         "volume/compositing.py",
         "dim=-1).diff(dim=-1).clamp_min(0.0)",
         "dim=-1).diff(dim=-1)",
@@ -208,29 +210,35 @@ MUTANTS: Sequence[Mutant] = (
         "test_losses.py",
     ),
     Mutant(
-        "L_Eik asks for no slope",
+        "L_Eik asks for gradients of length 0",
         "losses.py",
         "(_safe_norm(gradient) - 1.0).abs()",
         "_safe_norm(gradient).abs()",
         "test_losses.py",
     ),
-    Mutant("slope of a length at 0", "losses.py", ".clamp_min(1e-12).sqrt()", ".sqrt()", "test_losses.py"),
     Mutant(
-        "smoothing grows at edges",
+        "the gradient of a length is not finite at 0",
+        "losses.py",
+        ".clamp_min(1e-12).sqrt()",
+        ".sqrt()",
+        "test_losses.py",
+    ),
+    Mutant(
+        "L_smth is stronger at edges of the image",
         "losses.py",
         "torch.exp(-image_gradient)",
         "torch.exp(image_gradient)",
         "test_losses.py",
     ),
     Mutant(
-        "L_pcd turns normals around",
+        "L_pcd asks for the opposite normal",
         "losses.py",
         "distance.abs() + (1.0 - cosine)",
         "distance.abs() + (1.0 + cosine)",
         "test_losses.py",
     ),
     Mutant(
-        "scaled gradients scale the value",
+        "scaling a gradient also scales the value",
         "losses.py",
         "value.detach() * (1.0 - scale)",
         "value.detach() * scale",
@@ -238,49 +246,49 @@ MUTANTS: Sequence[Mutant] = (
     ),
     # Light.
     Mutant(
-        "rows of the map counted from below",
+        "the rows of the map are counted from the bottom",
         "fields/direction_map.py",
         "((edge - 0.5).clamp(0, height - 1)",
         "((height - edge - 0.5).clamp(0, height - 1)",
         "fields/test_environment.py",
     ),
     Mutant(
-        "density of the map without solid angles",
+        "pdf of the map without solid angles",
         "fields/map_sampling.py",
         "(share / cells.solid_angle)[texel]",
         "share[texel]",
         "fields/test_map_sampling.py",
     ),
     Mutant(
-        "sampling of the map without the cosine",
+        "the map is sampled without the cosine",
         "fields/map_sampling.py",
         "power * cosine.clamp_min(0)",
         "power * torch.ones_like(cosine)",
         "fields/test_map_sampling.py",
     ),
     Mutant(
-        "lamps fall off with the distance, not its square",
+        "lamps fall off with the distance, not with its square",
         "fields/lamps.py",
         "math.pi * radius**2 / distance.square(), _emission",
         "math.pi * radius**2 / distance, _emission",
         "fields/test_lamps.py",
     ),
     Mutant(
-        "lamps shine backwards",
+        "panels also emit backwards",
         "fields/lamps.py",
         "(-(wi * axis).sum(-1)).clamp_min(0)",
         "(wi * axis).sum(-1).abs()",
         "fields/test_lamps.py",
     ),
     Mutant(
-        "walls hide no lamp",
+        "shadow rays to lamps are ignored",
         "incident/arriving.py",
         "radiance * visibility[..., None]",
         "radiance * 1.0",
         "incident/test_arriving.py",
     ),
     Mutant(
-        "light shines through the scene",
+        "the light is also added where the scene blocks it",
         "incident/arriving.py",
         "torch.nonzero(~scene.hit, as_tuple=True)",
         "torch.nonzero(scene.hit | ~scene.hit, as_tuple=True)",
@@ -288,14 +296,14 @@ MUTANTS: Sequence[Mutant] = (
     ),
     # Readers.
     Mutant(
-        "camera's centre without its sign",
+        "the camera's centre has the wrong sign",
         "data/views.py",
         "-rotation @ self.w2c[:3, 3:]",
         "rotation @ self.w2c[:3, 3:]",
         "data/test_capture.py",
     ),
     Mutant(
-        "scene frame is not centred",
+        "the scene frame is not shifted to the centre",
         "data/views.py",
         "(points - points.new_tensor(self.center)) / self.scale",
         "points / self.scale",
@@ -309,35 +317,35 @@ MUTANTS: Sequence[Mutant] = (
         "hard_cases/test_captures.py",
     ),
     Mutant(
-        "mirrored cameras are taken",
+        "mirrored cameras are accepted",
         "data/views.py",
         "if np.linalg.det(rotation) < 0:",
         "if np.linalg.det(rotation) < -2:",
         "hard_cases/test_captures.py",
     ),
     Mutant(
-        "cameras whose rays do not fit into float32 are taken",
+        "cameras whose rays overflow float32 are accepted",
         "data/views.py",
         "if min(camera.fx, camera.fy) < MIN_FOCAL or",
         "if False and",
         "hard_cases/test_captures.py",
     ),
     Mutant(
-        "sizes in headers are believed",
+        "sizes in headers are not checked",
         "data/images.py",
         "width * height <= MAX_PIXELS",
         "True",
         "data/test_images.py",
     ),
     Mutant(
-        "red and blue swapped",
+        "red and blue are swapped",
         "data/images.py",
         "return samples[..., [2, 1, 0, 3][: samples.shape[2]]]\n\n\ndef _png_samples",
         "return samples\n\n\ndef _png_samples",
         "data/test_images.py",
     ),
     Mutant(
-        "points of no finite place are taken",
+        "points that are not finite are accepted",
         "data/point_cloud.py",
         "~(np.isfinite(position) & np.isfinite(normal)).all(axis=1)",
         "~np.isfinite(position).any(axis=1)",
@@ -366,14 +374,14 @@ MUTANTS: Sequence[Mutant] = (
         "train/test_resume.py",
     ),
     Mutant(
-        "steps share their random numbers",
+        "all steps use the same random numbers",
         "train/optimizer.py",
         "(seed * 1_000_003 + step) * 4_099 + rank",
         "seed * 4_099 + rank",
         "train/test_resume.py",
     ),
     Mutant(
-        "steps that are not finite are taken",
+        "steps that are not finite are not skipped",
         "train/loop.py",
         "if all(math.isfinite(value) for value in (loss, *mean_norms)):",
         "if True:",

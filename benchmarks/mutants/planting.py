@@ -18,7 +18,7 @@ from pathlib import Path
 
 from benchmarks.mutants.faults import Mutant
 
-__all__ = ["ROOT", "Verdict", "planted", "try_all"]
+__all__ = ["ROOT", "Outcome", "planted", "try_all"]
 
 ROOT = Path(__file__).parents[2]
 """The repository."""
@@ -35,26 +35,26 @@ LOADED_BEFORE = (
     "lightning_fabric",
     "hypothesis",
 )
-"""What tests use of others, loaded once and shared by all processes."""
+"""Packages that the tests import, loaded once and shared by all processes."""
 LONGEST = 300.0
-"""Seconds of computing that the tests of one fault may take."""
+"""Seconds of computation that the tests of one fault may take."""
 LONGEST_BY_CLOCK = 3000
-"""Seconds by the clock that they may take, if they wait without computing."""
+"""Seconds of wall-clock time that they may take."""
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """What the tests of a fault did: `noticed_by` is the first that failed; none: all passed."""
+class Outcome:
+    """A fault, and the first of its tests that failed; None if all passed."""
 
     mutant: Mutant
     noticed_by: str | None
 
 
 def planted(mutant: Mutant, source: str) -> str:
-    """The source of the module with the fault.
+    """Return the source of a module with the fault.
 
     Raises:
-        ValueError: what is to be changed does not stand there once.
+        ValueError: the code to change does not occur exactly once.
     """
     if source.count(mutant.old) != 1:
         raise ValueError(
@@ -64,16 +64,20 @@ def planted(mutant: Mutant, source: str) -> str:
 
 
 def try_all(
-    mutants: Sequence[Mutant], on_verdict: Callable[[Verdict], None] = lambda _: None
-) -> list[Verdict]:
-    """Run the tests of each fault, before that once without any.
+    mutants: Sequence[Mutant], on_outcome: Callable[[Outcome], None] = lambda _: None
+) -> list[Outcome]:
+    """Run the tests of each fault; before that, run them once without a fault.
+
+    Args:
+        mutants: the faults.
+        on_outcome: called with each outcome as soon as it is known.
 
     Raises:
         RuntimeError: a test fails without a fault.
     """
     for name in LOADED_BEFORE:
         importlib.import_module(name)
-    verdicts = []
+    outcomes = []
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         ignored = shutil.ignore_patterns("__pycache__")
@@ -87,14 +91,14 @@ def try_all(
             path = copy / "neilfpp_method" / mutant.module
             whole = path.read_text()
             path.write_text(planted(mutant, whole))
-            verdicts.append(Verdict(mutant, _first_failure(copy, mutant.tests)))
+            outcomes.append(Outcome(mutant, _first_failure(copy, mutant.tests)))
             path.write_text(whole)
-            on_verdict(verdicts[-1])
-    return verdicts
+            on_outcome(outcomes[-1])
+    return outcomes
 
 
 class _Failures:
-    """A plugin of pytest that writes down the first failure."""
+    """A pytest plugin that writes the first failure to a file."""
 
     def __init__(self, place: Path) -> None:
         self.place = place
@@ -108,7 +112,7 @@ class _Failures:
 
 
 def _first_failure(copy: Path, tests: str) -> str | None:
-    """The first test of a file that fails, or how the process ended that ran them; none: all pass."""
+    """The first test of a file that fails, or how their process ended; None if all pass."""
     failed = copy / "failed"
     failed.unlink(missing_ok=True)
     child = os.fork()

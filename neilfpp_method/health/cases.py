@@ -1,4 +1,4 @@
-"""Derive findings from measurements of a run: each case has a limit, a likely cause and a remedy.
+"""The cases of a training that goes wrong: each has a limit, a likely cause and a remedy.
 
 Remedies name settings, which `neilfpp train` takes as `--config.train.sdf-steps` and so on, because users of
 `attach_neilf` have no command line.
@@ -16,6 +16,13 @@ from typing import Literal
 from neilfpp_method.health.measure import SurfaceMeasurement
 
 __all__ = [
+    "FEW_LIGHT_POINTS",
+    "FOG",
+    "MATERIAL_AT_BOUNDS",
+    "NOTHING_SHADED",
+    "NO_SURFACE",
+    "SKIPPED_STEPS",
+    "Case",
     "Finding",
     "Health",
     "Verdict",
@@ -74,6 +81,111 @@ class Finding:
         return f"step {self.step}: {self.what}; likely {self.cause}; {self.remedy}"
 
 
+@dataclass(frozen=True)
+class Case:
+    """What all findings of one case have in common; the attributes are those of `Finding`."""
+
+    name: str
+    severe: bool
+    cause: str
+    remedy: str
+
+    def found(self, step: int, what: str) -> Finding:
+        """A finding of this case."""
+        return Finding(self.name, self.severe, step, what, self.cause, self.remedy)
+
+
+NO_SURFACE = Case(
+    name="no_surface",
+    severe=True,
+    cause="a scene box that misses the object, or masks that are inverted",
+    remedy="check that the object lies in the unit sphere of the scene and that masks are 1 on it "
+    "(`neilfpp inspect` draws both for a capture)",
+)
+FOG = Case(
+    name="fog",
+    severe=True,
+    cause="a scene box that contains the cameras, or too few views, steps or masks",
+    remedy="check the scene box (`neilfpp inspect` draws that of a capture), give masks, or train the "
+    "geometry for more steps (train.sdf_steps)",
+)
+NOTHING_SHADED = Case(
+    name="nothing_shaded",
+    severe=True,
+    cause="a distance field that never formed a surface",
+    remedy="look at a rendering of the geometry (in a run folder previews/sdf_init.png)",
+)
+FEW_LIGHT_POINTS = Case(
+    name="few_light_points",
+    severe=False,
+    cause="masks or a surface that leave few pixels to shade",
+    remedy="check the masks and a rendering of the geometry, or use more rays per step (train.rays, in your "
+    "own loop the size of the batch)",
+)
+MATERIAL_AT_BOUNDS = Case(
+    name="material_at_bounds",
+    severe=False,
+    cause="a light with a wrong scale",
+    remedy="give a known environment map (light.map, in `neilfpp train` --light), or read docs/light.md",
+)
+SKIPPED_STEPS = Case(
+    name="skipped_steps",
+    severe=False,
+    cause="pixels far above the rest, or learning rates that are too high",
+    remedy="look for the brightest pixels (`neilfpp inspect` reports those of a capture), or lower the "
+    "learning rates (optimizer)",
+)
+
+
+# ------------------------------------------------------------------------------------------------- conditions
+
+
+def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
+    """Find `NO_SURFACE` or `FOG`, at the end of a stage that trains the surface or later."""
+    if measured.opaque < MIN_OPAQUE:
+        what = f"only {measured.opaque:.0%} of the object's pixels show a surface"
+        return [NO_SURFACE.found(step, what)]
+    if measured.sharp < MIN_SHARP:
+        what = f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is fog"
+        return [FOG.found(step, what)]
+    return []
+
+
+def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
+    """Find `MATERIAL_AT_BOUNDS`."""
+    if measured.at_bound is None or measured.at_bound <= MAX_AT_BOUND:
+        return []
+    what = f"the base colour of {measured.at_bound:.0%} of the surface is black or white"
+    return [MATERIAL_AT_BOUNDS.found(step, what)]
+
+
+def nothing_shaded(steps: int, step: int) -> list[Finding]:
+    """Find `NOTHING_SHADED`, after `steps` consecutive steps without a surface point to shade."""
+    if steps < MAX_EMPTY_STEPS:
+        return []
+    what = f"no surface point was shaded for {steps} steps, so material and light learn nothing"
+    return [NOTHING_SHADED.found(step, what)]
+
+
+def few_light_points(points: int, step: int) -> list[Finding]:
+    """Find `FEW_LIGHT_POINTS`, after a fit of the light to `points` points."""
+    if points >= MIN_LIGHT_POINTS:
+        return []
+    what = f"the light was fitted to only {points} surface points, without a decision about lamps"
+    return [FEW_LIGHT_POINTS.found(step, what)]
+
+
+def skipped_steps(skipped: int, step: int) -> list[Finding]:
+    """Find `SKIPPED_STEPS`, after `skipped` of the first `step` steps were skipped."""
+    if step < MIN_STEPS or skipped <= MAX_SKIPPED * step:
+        return []
+    what = f"{skipped} of {step} steps were skipped, as they were not finite"
+    return [SKIPPED_STEPS.found(step, what)]
+
+
+# --------------------------------------------------------------------------------------------------- verdicts
+
+
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
     """The verdict that follows from all findings: that of the worst one."""
     severe = [finding.severe for finding in findings]
@@ -100,100 +212,3 @@ class Health:
 
     def __str__(self) -> str:
         return self.verdict + (": " + "; ".join(f.what for f in self.findings) if self.findings else "")
-
-
-def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
-    """Findings on the surface, at the end of a stage that trains it or later."""
-    if measured.opaque < MIN_OPAQUE:
-        return [
-            Finding(
-                case="no_surface",
-                severe=True,
-                step=step,
-                what=f"only {measured.opaque:.0%} of the object's pixels show a surface",
-                cause="a scene box that misses the object, or masks that are inverted",
-                remedy="check that the object lies in the unit sphere of the scene and that masks are 1 on "
-                "it (`neilfpp inspect` draws both for a capture)",
-            )
-        ]
-    if measured.sharp < MIN_SHARP:
-        return [
-            Finding(
-                case="fog",
-                severe=True,
-                step=step,
-                what=f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene "
-                "is fog",
-                cause="a scene box that contains the cameras, or too few views, steps or masks",
-                remedy="check the scene box (`neilfpp inspect` draws that of a capture), give masks, or "
-                "train the geometry for more steps (train.sdf_steps)",
-            )
-        ]
-    return []
-
-
-def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
-    """Findings on the material."""
-    if measured.at_bound is None or measured.at_bound <= MAX_AT_BOUND:
-        return []
-    return [
-        Finding(
-            case="material_at_bounds",
-            severe=False,
-            step=step,
-            what=f"the base colour of {measured.at_bound:.0%} of the surface is black or white",
-            cause="a light with a wrong scale",
-            remedy="give a known environment map (light.map, in `neilfpp train` --light), or read "
-            "docs/light.md",
-        )
-    ]
-
-
-def nothing_shaded(steps: int, step: int) -> list[Finding]:
-    """Finding that `steps` consecutive steps had no surface point to shade."""
-    if steps < MAX_EMPTY_STEPS:
-        return []
-    return [
-        Finding(
-            case="nothing_shaded",
-            severe=True,
-            step=step,
-            what=f"no surface point was shaded for {steps} steps, so material and light learn nothing",
-            cause="a distance field that never formed a surface",
-            remedy="look at a rendering of the geometry (in a run folder previews/sdf_init.png)",
-        )
-    ]
-
-
-def few_light_points(points: int, step: int) -> list[Finding]:
-    """Finding that the light was fitted to too few points."""
-    if points >= MIN_LIGHT_POINTS:
-        return []
-    return [
-        Finding(
-            case="few_light_points",
-            severe=False,
-            step=step,
-            what=f"the light was fitted to only {points} surface points, without a decision about lamps",
-            cause="masks or a surface that leave few pixels to shade",
-            remedy="check the masks and a rendering of the geometry, or use more rays per step (train.rays, "
-            "in your own loop the size of the batch)",
-        )
-    ]
-
-
-def skipped_steps(skipped: int, step: int) -> list[Finding]:
-    """Finding that too many of the first `step` steps were skipped."""
-    if step < MIN_STEPS or skipped <= MAX_SKIPPED * step:
-        return []
-    return [
-        Finding(
-            case="skipped_steps",
-            severe=False,
-            step=step,
-            what=f"{skipped} of {step} steps were skipped, as they were not finite",
-            cause="pixels far above the rest, or learning rates that are too high",
-            remedy="look for the brightest pixels (`neilfpp inspect` reports those of a capture), or lower "
-            "the learning rates (optimizer)",
-        )
-    ]

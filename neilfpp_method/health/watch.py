@@ -8,6 +8,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from neilfpp_method.health.cases import (
+    FEW_LIGHT_POINTS,
+    FOG,
+    MATERIAL_AT_BOUNDS,
+    NO_SURFACE,
+    NOTHING_SHADED,
+    SKIPPED_STEPS,
+    Case,
     Finding,
     Health,
     few_light_points,
@@ -51,11 +58,11 @@ class Watch:
         if not plan.moves_material:
             return
         self.empty_steps = 0 if len(computed.surface_rows) else self.empty_steps + 1
-        self._replace(("nothing_shaded",), nothing_shaded(self.empty_steps, step))
+        self._replace([NOTHING_SHADED], nothing_shaded(self.empty_steps, step))
 
     def after_fit(self, points: int, step: int) -> None:
         """Check the number of points to which the light was fitted."""
-        self._replace(("few_light_points",), few_light_points(points, step))
+        self._replace([FEW_LIGHT_POINTS], few_light_points(points, step))
 
     def after_stage(self, model: NeilfModel, plan: StagePlan, skipped: int, step: int) -> None:
         """Measure and check the surface, and the material in a stage that trains it."""
@@ -63,13 +70,13 @@ class Watch:
 
     def judge(self, measured: SurfaceMeasurement, skipped: int, step: int) -> None:
         """Check a measurement and the number of steps skipped so far."""
-        self._replace(("no_surface", "fog"), surface_findings(measured, step))
-        self._replace(("material_at_bounds",), material_findings(measured, step))
-        self._replace(("skipped_steps",), skipped_steps(skipped, step))
+        self._replace([NO_SURFACE, FOG], surface_findings(measured, step))
+        self._replace([MATERIAL_AT_BOUNDS], material_findings(measured, step))
+        self._replace([SKIPPED_STEPS], skipped_steps(skipped, step))
 
-    def _replace(self, cases: Sequence[str], findings: Sequence[Finding]) -> None:
+    def _replace(self, cases: Sequence[Case], findings: Sequence[Finding]) -> None:
         """Replace the findings of some cases, and warn of those that are new."""
-        before = {case: self.findings.pop(case) for case in cases if case in self.findings}
+        before = {case.name: self.findings.pop(case.name) for case in cases if case.name in self.findings}
         for finding in findings:
             if finding.case not in before:
                 self.warn(finding.line())

@@ -1,1 +1,1 @@
-"""Inspect a capture: figures of its views, findings on defects, and a verdict on its radiance."""
+"""Inspect a capture: figures of its views, its defects, and the quality of its radiance."""

@@ -1,4 +1,4 @@
-"""Run `neilfpp inspect`: print the findings, and write them as JSON and as a picture."""
+"""Run `neilfpp inspect`: print the defects, and write them as JSON and as a picture."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.text import Text
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import replacing, write_png
 from neilfpp_method.errors import EarlyEnd
-from neilfpp_method.inspection.findings import Inspection, inspect_capture
+from neilfpp_method.inspection.defects import Inspection, inspect_capture
 from neilfpp_method.inspection.picture import draw
 
 __all__ = ["run_inspection", "to_json"]
@@ -60,7 +60,7 @@ def run_inspection(
             temporary.write_text(json.dumps(to_json(inspection), indent=2, allow_nan=False) + "\n", "utf-8")
         write_png(out / "inspect.png", draw(inspection))
         console.print(f"written to {out}", highlight=False)
-    problems = sum(finding.severity == "problem" for finding in inspection.findings)
+    problems = sum(defect.severity == "problem" for defect in inspection.defects)
     if strict and problems:
         raise EarlyEnd(
             f"{root}: {problems} problem{'s' * (problems != 1)}",
@@ -87,16 +87,16 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
             "coverage": placement.coverage,
             "degrees_between_views": placement.gap,
         },
-        "verdict": {"quality": inspection.verdict.quality, "text": inspection.verdict.text},
-        "findings": [
+        "radiance": {"level": inspection.radiance.level, "text": inspection.radiance.text},
+        "defects": [
             {
-                "kind": f.kind,
-                "severity": f.severity,
-                "text": f.text,
-                "remedy": f.remedy,
-                "views": list(f.views),
+                "kind": defect.kind,
+                "severity": defect.severity,
+                "text": defect.text,
+                "remedy": defect.remedy,
+                "views": list(defect.views),
             }
-            for f in inspection.findings
+            for defect in inspection.defects
         ],
         "views": [
             {
@@ -119,14 +119,14 @@ def _print(inspection: Inspection, console: Console) -> None:
     def say(*parts: str | tuple[str, str]) -> None:
         console.print(Text.assemble(*parts), soft_wrap=True)
 
-    placement, verdict = inspection.placement, inspection.verdict
+    placement, radiance = inspection.placement, inspection.radiance
     say(inspection.capture.summary)
     say(
         f"cameras: a median angle of {placement.gap:.0f}° to the nearest camera; they cover "
         f"{100 * placement.coverage:.0f} % of all directions"
     )
-    say("radiance: ", (verdict.quality, STYLES[verdict.quality]), f"; {verdict.text}")
-    if not inspection.findings:
+    say("radiance: ", (radiance.level, STYLES[radiance.level]), f"; {radiance.text}")
+    if not inspection.defects:
         say(("no problems found", STYLES["good"]))
-    for finding in inspection.findings:
-        say((finding.severity, STYLES[finding.severity]), f": {finding.line()}")
+    for defect in inspection.defects:
+        say((defect.severity, STYLES[defect.severity]), f": {defect.line()}")

@@ -1,4 +1,4 @@
-"""Measure one view: brightness, sharpness, clipping and more. `findings` judges these figures."""
+"""Measure one view: brightness, sharpness, clipping and more. `defects` judges these figures."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from neilfpp_method.inspection.findings import Inspection
+from neilfpp_method.inspection.defects import Inspection
 from neilfpp_method.shading.color import tone_map
 
 __all__ = ["draw"]
@@ -15,7 +15,7 @@ __all__ = ["draw"]
 PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
 """Colours of the background, of text, and of secondary text."""
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
-"""Frame colours of views with a problem, with a warning, and without findings."""
+"""Frame colours of views with a problem, with a warning, and without defects."""
 SEVEREST_FIRST = (PROBLEM, WARNING, FINE)
 """Order in which views are drawn, by the colour of their frame."""
 CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
@@ -39,9 +39,9 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
     top = MARGIN + 70 + PLAN + 2 * GAP
     sheet = Image.new("RGB", (width, top + rows * (CELL + LABEL + GAP) + MARGIN), PAPER)
     pen = ImageDraw.Draw(sheet)
-    verdict, capture = inspection.verdict, inspection.capture
+    radiance, capture = inspection.radiance, inspection.capture
     _write(pen, (MARGIN, MARGIN - 6), f"{capture.root.resolve().name}: {len(capture.views)} views", 26)
-    _write(pen, (MARGIN, MARGIN + 32), f"radiance {verdict.quality}: {verdict.text}", 16, PALE_INK)
+    _write(pen, (MARGIN, MARGIN + 32), f"radiance {radiance.level}: {radiance.text}", 16, PALE_INK)
     for k, (axes, title) in enumerate([((0, 1), "along z (x, y)"), ((0, 2), "along y (x, z)")]):
         plan = Image.fromarray(_plan(inspection, axes, colors, title))
         sheet.paste(plan, (MARGIN + k * (PLAN + 2 * GAP), MARGIN + 70))
@@ -51,7 +51,7 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
         corner = (MARGIN + place % COLUMNS * (CELL + GAP), top + place // COLUMNS * (CELL + LABEL + GAP))
         view = inspection.views[i]
         picture = Image.fromarray(_shown(view.small, exposure))
-        kinds = [f.kind.replace("_", " ") for f in inspection.findings if view.name in f.views]
+        kinds = [d.kind.replace("_", " ") for d in inspection.defects if view.name in d.views]
         _cell(sheet, pen, corner, picture, colors[i])
         _write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
         _write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, colors[i])
@@ -60,9 +60,9 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
 
 def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
     problems = {
-        name for finding in inspection.findings if finding.severity == "problem" for name in finding.views
+        name for defect in inspection.defects if defect.severity == "problem" for name in defect.views
     }
-    warnings = {name for finding in inspection.findings for name in finding.views}
+    warnings = {name for defect in inspection.defects for name in defect.views}
     return [
         PROBLEM if v.name in problems else WARNING if v.name in warnings else FINE for v in inspection.views
     ]
@@ -91,11 +91,11 @@ def _plan(
 
 
 def _list(pen: ImageDraw.ImageDraw, corner: tuple[int, int], inspection: Inspection) -> None:
-    for place, finding in enumerate(inspection.findings):
-        count = f": {len(finding.views)} view{'s' * (len(finding.views) != 1)}" if finding.views else ""
-        color = PROBLEM if finding.severity == "problem" else WARNING
-        _write(pen, (corner[0], corner[1] + 26 * place), finding.kind.replace("_", " ") + count, 16, color)
-    if not inspection.findings:
+    for place, defect in enumerate(inspection.defects):
+        count = f": {len(defect.views)} view{'s' * (len(defect.views) != 1)}" if defect.views else ""
+        color = PROBLEM if defect.severity == "problem" else WARNING
+        _write(pen, (corner[0], corner[1] + 26 * place), defect.kind.replace("_", " ") + count, 16, color)
+    if not inspection.defects:
         _write(pen, corner, "no problems found", 16, FINE)
 
 

@@ -15,9 +15,7 @@ from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
-from neilfpp_method.data.drawing import BLOCK, PixelDraws
-from neilfpp_method.data.drawing import NEAR as NEAR_BIT
-from neilfpp_method.data.drawing import VALID as VALID_BIT
+from neilfpp_method.data import drawing
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.views import CameraRays
 from neilfpp_method.errors import UserError
@@ -74,7 +72,7 @@ class CaptureDataset(InputDataset):
         self.metadata[PIXELS] = self.pixels
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "H W 3"]:
-        """The image as stored in its file."""
+        """The colours of a view as stored in its file: linear radiance or display values."""
         return self._image(image_idx, self.pixels.view(image_idx, gradients=False).color)
 
     def get_metadata(self, data: dict[str, Any]) -> dict[str, Tensor]:
@@ -93,7 +91,13 @@ class CaptureDataset(InputDataset):
 
 
 def to_pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -> PixelBatch:
-    """Convert nerfstudio's rays and batch of pixels to a `PixelBatch`; both are in the scene frame."""
+    """Convert nerfstudio's rays and pixels of a training step to a `PixelBatch`.
+
+    Args:
+        origins: (N, 3) in the scene frame.
+        directions: (N, 3), unit.
+        batch: values of the N pixels, as drawn by `CapturePixelSampler` from a `CaptureDataset`.
+    """
     facts = {name: batch[key].to(origins.device)[:, 0] for key, name in FACTS.items()}
     color, view = batch["image"].to(origins.device), batch["indices"][:, 0].to(origins.device)
     return PixelBatch(origins=origins, directions=directions, color=color, view=view, **facts)
@@ -106,7 +110,7 @@ class CapturePixelSampler(PixelSampler):
     """
 
     _valid: Tensor | None = None
-    _draws: PixelDraws
+    _draws: drawing.PixelDraws
 
     def collate_image_dataset_batch(
         self, batch: dict[str, Any], num_rays_per_batch: int, keep_full_image: bool = False
@@ -118,9 +122,10 @@ class CapturePixelSampler(PixelSampler):
         # Nerfstudio shuffles the images when it loads them.
         order = batch["image_idx"].cpu().argsort()
         if self._valid is not batch[VALID]:
-            bits = VALID_BIT * batch[VALID].cpu()[order] + NEAR_BIT * batch[NEAR].cpu()[order]
-            padded = torch.nn.functional.pad(bits.flatten(), (0, -bits.numel() % BLOCK))
-            self._valid, self._draws = batch[VALID], PixelDraws(padded.to(torch.uint8).numpy(), bits.numel())
+            bits = drawing.VALID * batch[VALID].cpu()[order] + drawing.NEAR * batch[NEAR].cpu()[order]
+            padded = torch.nn.functional.pad(bits.flatten(), (0, -bits.numel() % drawing.BLOCK))
+            self._valid = batch[VALID]
+            self._draws = drawing.PixelDraws(padded.to(torch.uint8).numpy(), bits.numel())
         number = self._draws.draw(num_rays_per_batch)
         row, column = number // width % height, number % width
         place = order[number // (height * width)]

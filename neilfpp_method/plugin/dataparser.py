@@ -27,8 +27,11 @@ from neilfpp_method.errors import UserError
 __all__ = ["CaptureParser", "CaptureParserConfig", "capture_of", "neilfpp_data"]
 
 CAPTURE = "neilfpp_capture"
+"""Key of the metadata of `neilfpp-data` under which the `Capture` is."""
 ORDER = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""Distortion coefficients in nerfstudio's order."""
 MODELS = {CameraType.PERSPECTIVE.value: "OPENCV", CameraType.FISHEYE.value: FISHEYE}
+"""COLMAP's lens model for each of nerfstudio's types of camera that are supported."""
 
 
 @dataclass
@@ -71,6 +74,8 @@ class CaptureParser(DataParser):
 
 
 def _cameras(cameras: Sequence[Camera]) -> Cameras:
+    """Convert cameras, whose axes are OpenCV's, to nerfstudio's, whose axes are OpenGL's."""
+
     def column(name: str) -> torch.Tensor:
         return torch.tensor([[getattr(camera, name)] for camera in cameras])
 
@@ -98,16 +103,18 @@ def _distortion(camera: Camera) -> list[float]:
     Raises:
         UserError: if nerfstudio does not support the lens model.
     """
-    known = nerfstudio_coefficients(camera)
-    if known is None:
+    coefficients = nerfstudio_coefficients(camera)
+    if coefficients is None:
         raise UserError(
             f"nerfstudio has no lens {camera.lens.model}", "undistort the images, or use `neilfpp train`"
         )
-    return [known.get(name, 0.0) for name in ORDER]
+    return [coefficients.get(name, 0.0) for name in ORDER]
 
 
 def capture_of(outputs: DataparserOutputs) -> Capture:
-    """The capture of a dataparser's outputs: that of `neilfpp-data`, or one made from other outputs.
+    """Return the capture of a dataparser's outputs: that of `neilfpp-data`, or one made from other outputs.
+
+    The scene frame of a capture made from other outputs is nerfstudio's frame.
 
     Raises:
         UserError: if a camera is neither perspective nor fisheye, or if HDR and LDR images are mixed.
@@ -123,17 +130,22 @@ def capture_of(outputs: DataparserOutputs) -> Capture:
     if len(kinds) > 1:
         raise UserError(f"{views[0].image.parent}: HDR and LDR images together", "use images of one kind")
     folder = views[0].image.parent
-    return Capture(
-        folder, "nerfstudio", folder, views, Normalization(1.0, (0.0, 0.0, 0.0)), kinds.pop(), frozenset()
-    )
+    identity = Normalization(scale=1.0, center=(0.0, 0.0, 0.0))
+    return Capture(folder, "nerfstudio", folder, views, identity, kinds.pop(), frozenset())
 
 
 def _camera(cameras: Cameras, i: int) -> Camera:
+    """Convert the i-th of nerfstudio's cameras.
+
+    Raises:
+        UserError: if the camera or its lens is not supported.
+    """
     kind = int(cameras.camera_type[i])
     if kind not in MODELS:
         raise UserError(f"camera {i} is neither perspective nor fisheye", "cut perspective images out of it")
-    bends = torch.zeros(6) if cameras.distortion_params is None else cameras.distortion_params[i]
-    distortion = dict(zip(ORDER, bends.double().tolist(), strict=True))
+    known = cameras.distortion_params
+    coefficients = [0.0] * len(ORDER) if known is None else known[i].double().tolist()
+    distortion = dict(zip(ORDER, coefficients, strict=True))
     c2w = np.eye(4)
     c2w[:3] = cameras.camera_to_worlds[i].double().numpy() * FLIP
     intrinsics = (float(getattr(cameras, name)[i]) for name in ("fx", "fy", "cx", "cy"))

@@ -14,7 +14,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.models.base_model import Model, ModelConfig
-from nerfstudio.utils import colormaps
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
@@ -25,7 +24,6 @@ from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import improve_material, light_places, review_light
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate import metrics
 from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
@@ -34,14 +32,15 @@ from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.plugin.datamanager import PIXELS, VALID, to_pixel_batch
+from neilfpp_method.plugin.datamanager import PIXELS, to_pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
+from neilfpp_method.plugin.pictures import view_figures, view_pictures
 from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.shading.color import apply_response, tone_map
+from neilfpp_method.shading.color import apply_response
 from neilfpp_method.shading.sampling import combine, cosine
 from neilfpp_method.structures import Maps, RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
@@ -92,6 +91,21 @@ class NeilfMethod(Model):
     """The method as a nerfstudio model, which runs the three stages through nerfstudio's callbacks.
 
     The outputs `rgb` and `rgb_volume` are in the response of the capture: linear for HDR captures.
+
+    Attributes:
+        neilf: the method, on its own host or on a nerfstudio model.
+        rates: the learning rates.
+        proxy: the surface on which rays are traced for a nerfstudio model; None if none is needed.
+        pixels: the training pixels.
+        light_solver: finds the environment map and the lamps between steps.
+        watch: the findings of the health checks.
+        guard: skips steps that are not finite.
+        record: writes the run folder; None before training, and if no folder can be written.
+        computed: what the last step computed, until the light is solved; None otherwise.
+        evidence: the evidence for lamps of the last fit that decided about them; None if none has.
+        step: number of the current or last step; -1 before training.
+        set_up_for: the stage for which fields are frozen; None before the first step.
+        while_training: holds the process-wide settings of training, and restores the former ones at its end.
     """
 
     config: NeilfMethodConfig
@@ -177,7 +191,7 @@ class NeilfMethod(Model):
         # A loaded checkpoint already contains the map.
         if self.step < 0:
             show_known_light(self.neilf)
-        theirs = (
+        of_host = (
             self.neilf.host.inner.model.get_training_callbacks(training_callback_attributes)
             if isinstance(self.neilf.host, ForeignHost)
             else []
@@ -192,7 +206,7 @@ class NeilfMethod(Model):
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         return [
-            *theirs,
+            *of_host,
             TrainingCallback(before, self._begin_step, args=[optimizers]),
             TrainingCallback(after, self._solve_light),
             TrainingCallback(after, self._check_and_save, args=[trainer]),
@@ -203,6 +217,7 @@ class NeilfMethod(Model):
         ]
 
     def _begin_step(self, optimizers: Optimizers, step: int) -> None:
+        """Set up the stage if it is new, then the learning rates and the random numbers of the step."""
         settings = self.config.neilf.train
         self.step = step
         position = stage_at(step, settings)
@@ -230,7 +245,7 @@ class NeilfMethod(Model):
             start_with(self.neilf, self.light_solver, first)
 
     def _solve_light(self, step: int) -> None:
-        """Bound β and fit the light if due, after the optimizer step as in the standalone loop."""
+        """Bound β, solve for the light and search the material if due, after the optimizer's step."""
         settings = self.config.neilf
         limit_surface_width(self.neilf.host, settings.volume, stage_at(step, settings.train))
         if self.computed is None:
@@ -357,34 +372,8 @@ class NeilfMethod(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """PSNR and SSIM of display values on the object, as in `neilfpp eval`, and pictures of all maps."""
-        drawn = (batch["image"], outputs["rgb"], outputs["rgb_volume"])
-        truth, rgb, volume = (self._display(image.to(self.device)) for image in drawn)
-        # Without a mask, the rendered opacity selects the pixels of the object.
-        on_object = (
-            batch["object_mask"].cpu() > 0.5
-            if batch["mask_known"].any()
-            else outputs["accumulation"].cpu() > 0.5
-        )
-        mask = (on_object & batch[VALID].cpu())[..., 0].numpy()
-        arrays = {"": rgb, "volume_": volume}
-        figures = {
-            f"{name}{kind}": measure(image.cpu().numpy(), truth.cpu().numpy(), mask)
-            for name, image in arrays.items()
-            for kind, measure in {"psnr": metrics.psnr, "ssim": metrics.ssim}.items()
-        }
-        accumulation = outputs["accumulation"]
-        pictures = {
-            "img": torch.cat([truth, rgb], dim=1),
-            "rgb_volume": volume,
-            "normal": 0.5 * (outputs["normal"] + 1.0) * accumulation,
-            "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation),
-            "accumulation": accumulation.expand(-1, -1, 3),
-        }
-        if self._has_material():
-            pictures |= {name: tone_map(outputs[name]) for name in ("base_color", "incident_light")}
-            pictures |= {name: outputs[name].expand(-1, -1, 3) for name in ("roughness", "metallic")}
-        return figures, pictures
-
-    def _display(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-        return tone_map(image) if self.neilf.facts.response == "linear" else image.clamp(0.0, 1.0)
+        """Figures of a view, as in `neilfpp eval`, and pictures of its maps, for nerfstudio's log."""
+        batch = {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)}
+        response = self.neilf.facts.response
+        pictures = view_pictures(outputs, batch, response, self._has_material())
+        return view_figures(outputs, batch, response), pictures

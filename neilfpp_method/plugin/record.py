@@ -36,7 +36,7 @@ def no_record(trainer: Trainer, host: str | None) -> str | None:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Writes a run folder; its description is written together with the first checkpoint.
+    """Writes the run folder of a training; settings and source are written with the first checkpoint.
 
     Attributes:
         path: the run folder.
@@ -53,12 +53,12 @@ class RunRecord:
     @staticmethod
     def of(trainer: Trainer, settings: NeilfConfig, facts: SceneFacts) -> RunRecord:
         """The record of a trainer, next to its `config.yml`."""
-        pixels = trainer.config.pipeline.datamanager
-        parser = pixels.dataparser
-        train = dataclasses.replace(settings.train, rays=pixels.train_num_rays_per_batch)
-        data = pixels.data or parser.data
-        source = CaptureSource(str(Path(data).resolve()), parser.test_every, parser.response, parser.format)
+        manager = trainer.config.pipeline.datamanager
+        parser = manager.dataparser
+        train = dataclasses.replace(settings.train, rays=manager.train_num_rays_per_batch)
         config = dataclasses.replace(settings, train=train)
+        data = Path(manager.data or parser.data).resolve()
+        source = CaptureSource(str(data), parser.test_every, parser.response, parser.format)
         return RunRecord(Path(trainer.base_dir) / BESIDE_NERFSTUDIO, config, source, facts)
 
     def save(

@@ -20,7 +20,7 @@ from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, writ
 from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
-from neilfpp_method.inspection.findings import inspect_capture, problems, views_to_leave_out
+from neilfpp_method.inspection.defects import inspect_capture, problems, views_to_leave_out
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.prepare.pictures import write_picture

@@ -55,7 +55,7 @@ class Summary:
         radius: radius of the scene's sphere, world units.
         scene_from: origin of the scene's sphere.
         remarks: notes for the user.
-        problems: findings of `neilfpp inspect` that spoil or prevent a result.
+        problems: defects found by `neilfpp inspect` that spoil or prevent a result.
     """
 
     placements: tuple[Placement, ...]

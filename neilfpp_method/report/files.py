@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.health.cases import Finding
-from neilfpp_method.report.measured import Measured, numbers, read_measured
+from neilfpp_method.report.measured import OWN, Measured, numbers, read_measured
 from neilfpp_method.schedule import stage_steps
 from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
@@ -43,7 +45,7 @@ class Files:
         config: the settings of the run.
         steps: number of steps of the whole training.
         findings: findings of the health checks; None if the run has no record of them.
-        measured: figures by protocol; empty if the run was not evaluated.
+        measured: figures by protocol, this project's own first; empty if the run was not evaluated.
         timing: seconds by stage.
         work: seconds by stage and kind of work.
         checks: measurements at held-back pixels during training.
@@ -89,15 +91,15 @@ def read_files(path: Path) -> Files:
     def optional_json(name: str) -> dict[str, Any]:
         return read_or(lambda: read_json(path / name), {}) if (path / name).is_file() else {}
 
-    measured, damaged = read_measured(path)
-    notes += damaged
+    protocols = (OWN, *PROTOCOLS)
+    measured = {name: read_or(partial(read_measured, path, name), None) for name in protocols}
     rows = optional_json("effects.json").get("effects")
     return Files(
         path=path,
         config=config,
         steps=sum(stage_steps(config.train).values()),
         findings=read_or(lambda: read_findings(path), None),
-        measured=measured,
+        measured={name: figures for name, figures in measured.items() if figures is not None},
         timing=numbers(optional_json("timing.json")),
         work=read_or(lambda: read_work(path), {}),
         checks=read_or(lambda: read_checks(path), []),

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.json_files import read_json
 
@@ -47,28 +45,24 @@ class Measured:
         return f"{views} of {self.size[0]}×{self.size[1]} pixels"
 
 
-def read_measured(path: Path) -> tuple[dict[str, Measured], list[str]]:
-    """Read the figures of a run by protocol, this project's own first.
+def read_measured(path: Path, protocol: str) -> Measured | None:
+    """Read the figures of a run under one protocol.
 
-    Protocols that were not measured, or that this version does not know, are left out.
+    Args:
+        path: the folder of the run.
+        protocol: `OWN`, or a name in `evaluate.published.PROTOCOLS`.
 
     Returns:
-        The figures by name of the protocol, and one message per file that could not be read.
+        The figures; None if the run was not measured by this protocol.
+
+    Raises:
+        UserError: if the file is damaged.
     """
-    measurements: dict[str, Measured] = {}
-    notes: list[str] = []
-    for name in (OWN, *PROTOCOLS):
-        file = path / "metrics.json" if name == OWN else path / "eval" / f"{name}.json"
-        if not file.is_file():
-            continue
-        try:
-            measured = _own(file) if name == OWN else _published(name, file)
-        except UserError as error:
-            notes.append(str(error))
-            continue
-        if measured.figures:
-            measurements[name] = measured
-    return measurements, notes
+    file = path / "metrics.json" if protocol == OWN else path / "eval" / f"{protocol}.json"
+    if not file.is_file():
+        return None
+    measured = _own(file) if protocol == OWN else _published(protocol, file)
+    return measured if measured.figures else None
 
 
 def is_outdated(file: Path, run: Path) -> bool:

@@ -80,8 +80,18 @@ def _lattice(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> _Lattice:
     return _Lattice(strata(n, count, stochastic), (k * GOLDEN_TURN + shift).frac())
 
 
-def strata(like: Float[Tensor, "N 3"], count: int, stochastic: bool) -> Float[Tensor, "N S"]:
-    """One number in each of `count` equal intervals of [0, 1], for each row: random, or the midpoint."""
+def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N S"]:
+    """Ascending numbers in [0, 1], one in each of `count` equal strata, for each row of a tensor.
+
+    Args:
+        like: a tensor with N rows; the result has its device and type.
+        count: the number S of strata.
+        stochastic: whether a number is random in its stratum; otherwise it is the midpoint.
+
+    Example:
+        >>> strata(torch.zeros(1, 3), 4, stochastic=False)
+        tensor([[0.1250, 0.3750, 0.6250, 0.8750]])
+    """
     k = torch.arange(count, device=like.device, dtype=like.dtype).expand(len(like), count)
     return (k + (torch.rand_like(k) if stochastic else 0.5)) / count
 

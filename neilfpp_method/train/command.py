@@ -22,7 +22,7 @@ from neilfpp_method.effects.table import effects_table
 from neilfpp_method.errors import Unsound
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.inspection.findings import problems_of_poses
+from neilfpp_method.inspection.defects import problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.facts import SceneFacts

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.shading.sampling import strata
 from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
@@ -43,13 +44,6 @@ SPREAD = 1 / 3
 
 
 # -------------------------------------------------------------------------------------------- simple samplers
-
-
-def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N {count}"]:
-    """Ascending numbers in [0, 1], one in each of `count` equal strata: random, or at the centre."""
-    shape = (like.shape[0], count)
-    within = like.new_empty(shape).uniform_() if stochastic else like.new_full(shape, 0.5)
-    return (torch.arange(count, device=like.device, dtype=like.dtype) + within) / count
 
 
 @torch.no_grad()

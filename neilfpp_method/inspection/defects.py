@@ -1,4 +1,4 @@
-"""Find defects of a capture: figures that exceed limits, with remedies, and a verdict."""
+"""Find the defects of a capture: figures that exceed limits, with remedies."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.measure import ViewFigures, measure
+from neilfpp_method.inspection.radiance import RadianceQuality, radiance_quality
 from neilfpp_method.inspection.relations import (
     CameraPlacement,
     camera_placement,
@@ -20,9 +21,8 @@ from neilfpp_method.inspection.relations import (
 )
 
 __all__ = [
-    "Finding",
+    "Defect",
     "Inspection",
-    "Verdict",
     "inspect_capture",
     "problems",
     "problems_of_poses",
@@ -30,15 +30,13 @@ __all__ = [
 ]
 
 Severity = Literal["problem", "warning"]
-Quality = Literal["good", "limited", "poor"]
 
 JUMP = 1.5
 """Smallest ratio of the brightness of a view to that of its neighbours, or its inverse, that is reported."""
 BLURRED = 0.4
 """Ratio of the sharpness of a view to that of the others, below which it is blurred."""
-CLIPPED_VIEW, CLIPPED_A_BIT, CLIPPED_MUCH = 0.01, 0.001, 0.02
-"""Shares of clipped pixels that are reported: of a view; of all views, as a note; of all views, as a
-warning."""
+CLIPPED_VIEW = 0.01
+"""Share of clipped pixels above which a view is reported."""
 INVALID_VIEW = 0.5
 """Share of invalid pixels above which a view is reported."""
 MIN_COUNT, ADVISED_COUNT = 3, 16
@@ -64,13 +62,13 @@ REMOVABLE: Mapping[str, str] = {
     "blurred": "blurred",
     "duplicate": "the same picture as another",
 }
-"""Findings whose views `--auto` leaves out, with the reason in a few words."""
+"""Kinds of defects whose views `--auto` leaves out, with the reason in a few words."""
 MAX_NAMED = 6
-"""Largest number of views that a finding names; the others are counted."""
+"""Largest number of views that a defect names; the others are counted."""
 
 
 @dataclass(frozen=True)
-class Finding:
+class Defect:
     """A defect of a capture, and its remedy.
 
     A problem spoils or prevents a result, a warning degrades it. `views` has the names of the affected views;
@@ -85,18 +83,10 @@ class Finding:
     views: tuple[str, ...] = ()
 
     def line(self) -> str:
-        """The finding in one line for the console, without its severity."""
+        """The defect in one line for the console, without its severity."""
         rest = f" and {len(self.views) - MAX_NAMED} more" if len(self.views) > MAX_NAMED else ""
         named = f" [{', '.join(self.views[:MAX_NAMED])}{rest}]" if self.views else ""
         return f"{self.text}{named}; {self.remedy}"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether the radiance of a capture is good enough for the estimation of materials, and why."""
-
-    quality: Quality
-    text: str
 
 
 @dataclass(frozen=True)
@@ -108,16 +98,16 @@ class Inspection:
         views: figures of each view, in the order of the capture.
         placement: the placement of the cameras, in the same order.
         factors: brightness of each view relative to its neighbours (`exposure_factors`), in the same order.
-        findings: the defects, problems first.
-        verdict: the quality of the radiance.
+        defects: the defects, problems first.
+        radiance: the quality of the radiance.
     """
 
     capture: Capture
     views: tuple[ViewFigures, ...]
     placement: CameraPlacement
     factors: tuple[float, ...]
-    findings: tuple[Finding, ...]
-    verdict: Verdict
+    defects: tuple[Defect, ...]
+    radiance: RadianceQuality
 
 
 def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda name: None) -> Inspection:
@@ -133,16 +123,16 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
         on_view(view.name)
     placement = camera_placement(capture)
     factors = tuple(exposure_factors([view.luminance for view in views], placement).tolist())
-    findings = (*_of_views(views, factors, capture), *_of_cameras(capture, placement), *_of_scene(capture))
-    verdict = _verdict(capture, views, findings)
+    defects = (*_of_views(views, factors, capture), *_of_cameras(capture, placement), *_of_scene(capture))
+    radiance = radiance_quality(views, capture.hdr, {defect.kind for defect in defects})
     order = {"problem": 0, "warning": 1}
-    ranked = tuple(sorted(findings, key=lambda finding: order[finding.severity]))
-    return Inspection(capture, tuple(views), placement, factors, ranked, verdict)
+    ranked = tuple(sorted(defects, key=lambda defect: order[defect.severity]))
+    return Inspection(capture, tuple(views), placement, factors, ranked, radiance)
 
 
 def problems(inspection: Inspection) -> tuple[str, ...]:
-    """Return one line for the console per finding that is a problem."""
-    return _lines_of_problems(inspection.findings)
+    """Return one line for the console per defect that is a problem."""
+    return _lines_of_problems(inspection.defects)
 
 
 def problems_of_poses(capture: Capture) -> tuple[str, ...]:
@@ -151,8 +141,8 @@ def problems_of_poses(capture: Capture) -> tuple[str, ...]:
     return _lines_of_problems(found)
 
 
-def _lines_of_problems(findings: Sequence[Finding]) -> tuple[str, ...]:
-    return tuple(f"problem: {finding.line()}" for finding in findings if finding.severity == "problem")
+def _lines_of_problems(defects: Sequence[Defect]) -> tuple[str, ...]:
+    return tuple(f"problem: {defect.line()}" for defect in defects if defect.severity == "problem")
 
 
 def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
@@ -166,15 +156,15 @@ def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
         {'IMG_0017': 'blurred'}
     """
     proposed = {
-        name: REMOVABLE[finding.kind]
-        for finding in inspection.findings
-        if finding.kind in REMOVABLE
-        for name in finding.views
+        name: REMOVABLE[defect.kind]
+        for defect in inspection.defects
+        if defect.kind in REMOVABLE
+        for name in defect.views
     }
     return proposed if len(inspection.views) - len(proposed) >= MIN_COUNT else {}
 
 
-def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Finding]:
+def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Defect]:
     yield from _of_files(views)
     yield from _of_exposures(views, factors, capture)
     readable = [view for view in views if not view.unreadable]
@@ -182,26 +172,26 @@ def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: C
     yield from _of_values(readable, capture)
 
 
-def _of_files(views: Sequence[ViewFigures]) -> Iterator[Finding]:
-    """Findings on files that hold no usable image."""
+def _of_files(views: Sequence[ViewFigures]) -> Iterator[Defect]:
+    """Files that hold no usable image."""
     if damaged := [view for view in views if view.unreadable]:
         text, remedy = damaged[0].unreadable, "export these images again, or leave them out"
-        yield Finding("unreadable", "problem", text, remedy, _names(damaged))
+        yield Defect("unreadable", "problem", text, remedy, _names(damaged))
     if broken := [view for view in views if view.broken > 0]:
         most = max(view.broken for view in broken)
         text = f"pixels are NaN, infinite or negative, up to {100 * most:.2g} % of a view"
         remedy = "repair them, or mark them in a validity mask"
-        yield Finding("broken_pixels", "problem", text, remedy, _names(broken))
+        yield Defect("broken_pixels", "problem", text, remedy, _names(broken))
     if black := [view for view in views if not view.unreadable and view.luminance <= 0]:
         text = "all pixels of the object are black, or the whole picture has one colour"
         remedy = "leave these views out, or correct the masks"
-        yield Finding("black", "problem", text, remedy, _names(black))
+        yield Defect("black", "problem", text, remedy, _names(black))
 
 
 def _of_exposures(
     views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture
-) -> Iterator[Finding]:
-    """Findings on views that are brighter or darker than the views around them."""
+) -> Iterator[Defect]:
+    """Views that are brighter or darker than the views around them."""
     pairs = zip(views, factors, strict=True)
     jumps = {view.name: factor for view, factor in pairs if max(factor, 1 / factor) > JUMP}
     if jumps:
@@ -209,37 +199,37 @@ def _of_exposures(
         text = f"brighter or darker than the views around them: {named}"
         own = "give these views their exposure in capture.json"
         alike = "expose all images alike, or merge brackets"
-        yield Finding("exposure_jump", "problem", text, own if capture.hdr else alike, tuple(jumps))
+        yield Defect("exposure_jump", "problem", text, own if capture.hdr else alike, tuple(jumps))
 
 
-def _of_pictures(views: Sequence[ViewFigures]) -> Iterator[Finding]:
-    """Findings on pictures that add nothing: blurred ones and duplicates."""
+def _of_pictures(views: Sequence[ViewFigures]) -> Iterator[Defect]:
+    """Pictures that add nothing: blurred ones and duplicates."""
     sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
     if blurred := [view for view in views if 0 < view.sharpness < BLURRED * sharp]:
         text = f"blurred: less than {100 * BLURRED:.0f} % of the usual fine detail"
         remedy = "leave these views out, or take them again"
-        yield Finding("blurred", "warning", text, remedy, _names(blurred))
+        yield Defect("blurred", "warning", text, remedy, _names(blurred))
     if pairs := duplicates([view.small for view in views]) if views else ():
         named = _listed([f"{views[i].name} and {views[j].name}" for i, j in pairs], most=3)
         again = tuple(dict.fromkeys(views[j].name for _, j in pairs))
-        yield Finding("duplicate", "warning", f"the same picture twice: {named}", "keep one of each", again)
+        yield Defect("duplicate", "warning", f"the same picture twice: {named}", "keep one of each", again)
 
 
-def _of_values(views: Sequence[ViewFigures], capture: Capture) -> Iterator[Finding]:
-    """Findings on pixel values that carry too little information."""
+def _of_values(views: Sequence[ViewFigures], capture: Capture) -> Iterator[Defect]:
+    """Pixel values that carry too little information."""
     if clipped := [view for view in views if view.clipped > CLIPPED_VIEW]:
         worst = max(clipped, key=lambda view: view.clipped)
         text = f"highlights are clipped, up to {100 * worst.clipped:.2g} % of the object ({worst.name})"
         remedy = "use shorter exposures, or merge brackets; mark clipped pixels in a validity mask"
-        yield Finding("clipped", "warning", text, remedy, _names(clipped))
+        yield Defect("clipped", "warning", text, remedy, _names(clipped))
     if invalid := [view for view in views if view.invalid > INVALID_VIEW]:
         text = "more than half of the pixels are marked as invalid"
         remedy = "check the validity masks: white is valid"
-        yield Finding("mostly_invalid", "warning", text, remedy, _names(invalid))
+        yield Defect("mostly_invalid", "warning", text, remedy, _names(invalid))
     large = [view.levels for view in views if view.pixels > PIXELS_PER_LEVEL * DISPLAY_LEVELS]
     if capture.hdr and large and max(large) <= DISPLAY_LEVELS:
         text = f"linear files with {max(large)} levels per channel: they were converted from 8-bit images"
-        yield Finding("few_levels", "problem", text, "develop the RAW files linearly, or merge brackets")
+        yield Defect("few_levels", "problem", text, "develop the RAW files linearly, or merge brackets")
 
 
 def _names(views: Sequence[ViewFigures]) -> tuple[str, ...]:
@@ -251,44 +241,46 @@ def _listed(parts: Sequence[str], most: int) -> str:
     return ", ".join(parts[:most]) + ("…" if len(parts) > most else "")
 
 
-def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Finding]:
+def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Defect]:
+    """Cameras that see the wrong thing, are too few, or are too close to or too far from each other."""
     names = np.array([view.name for view in capture.views])
     if placement.away.any():
         text = "the cameras look away: the centre of the scene is not in the picture"
         remedy = "check the poses and the scene box, or leave these views out"
-        yield Finding("looking_away", "problem", text, remedy, tuple(names[placement.away]))
+        yield Defect("looking_away", "problem", text, remedy, tuple(names[placement.away]))
     if placement.within.any():
         text = "these cameras are inside the unit sphere, which should contain only the object"
-        yield Finding(
+        yield Defect(
             "camera_inside", "warning", text, "make the scene box smaller", tuple(names[placement.within])
         )
     count = len(names)
     if count < ADVISED_COUNT:
         severity: Severity = "problem" if count < MIN_COUNT else "warning"
         remedy = f"take {ADVISED_COUNT} or more, better 50, from all around"
-        yield Finding("few_views", severity, f"{count} view{'s' * (count != 1)}", remedy)
+        yield Defect("few_views", severity, f"{count} view{'s' * (count != 1)}", remedy)
     distance = max(1.0, float(np.median(np.linalg.norm(placement.centers, axis=1))))
     if count > 1 and np.ptp(placement.centers, axis=0).max() < BASELINE * distance:
         text = "all cameras are at one place, so the images hardly determine the geometry"
-        yield Finding("one_place", "problem", text, "take photographs from several sides")
+        yield Defect("one_place", "problem", text, "take photographs from several sides")
     if count >= MIN_COUNT and placement.coverage < MIN_COVERAGE:
         text = f"the views cover {100 * placement.coverage:.0f} % of the directions around the object"
-        yield Finding("coverage", "warning", text, "add views from other sides, and from other heights")
+        yield Defect("coverage", "warning", text, "add views from other sides, and from other heights")
     if count >= MIN_COUNT and placement.gap > SPARSE_GAP:
         text = f"{placement.gap:.0f}° is the median angle from a view to its nearest neighbour"
-        yield Finding("sparse", "warning", text, f"add views between them, at most {SPARSE_GAP:.0f}° apart")
+        yield Defect("sparse", "warning", text, f"add views between them, at most {SPARSE_GAP:.0f}° apart")
 
 
-def _of_scene(capture: Capture) -> Iterator[Finding]:
+def _of_scene(capture: Capture) -> Iterator[Defect]:
+    """A scene box without a reliable source, and a point cloud that is damaged or does not fit the box."""
     if capture.scene_from == "cameras":
         text = "position and size of the scene are guessed from the cameras only"
-        yield Finding("scale_guessed", "warning", text, "add a scene box, a point cloud or masks")
+        yield Defect("scale_guessed", "warning", text, "add a scene box, a point cloud or masks")
     if capture.point_cloud is None:
         return
     try:
         points = load_point_cloud(capture.point_cloud, capture.normalization).position
     except UserError as error:
-        yield Finding("point_cloud", "problem", error.problem, error.remedy)
+        yield Defect("point_cloud", "problem", error.problem, error.remedy)
         return
     reach = points.abs().amax(dim=-1).numpy()
     # A box around the point that the cameras look at excludes background points on purpose.
@@ -296,35 +288,7 @@ def _of_scene(capture: Capture) -> Iterator[Finding]:
     if outside > STRAY_POINTS:
         text = f"{100 * outside:.0f} % of the point cloud lies outside of the scene box"
         remedy = "make the scene box larger, or cut the cloud to the object"
-        yield Finding("scale", "problem" if outside > 0.5 else "warning", text, remedy)
+        yield Defect("scale", "problem" if outside > 0.5 else "warning", text, remedy)
     elif np.quantile(reach, 0.95) < SMALL_CLOUD:
         text = f"95 % of the point cloud lies within {100 * SMALL_CLOUD:.0f} % of the scene box"
-        yield Finding("scale", "warning", f"the object is small: {text}", "make the scene box smaller")
-
-
-def _verdict(capture: Capture, views: Sequence[ViewFigures], findings: Sequence[Finding]) -> Verdict:
-    readable = [view for view in views if not view.unreadable]
-    if not readable:
-        return Verdict("poor", "no image can be read")
-    kinds = {finding.kind for finding in findings}
-    clipped = float(np.mean([view.clipped for view in readable]))
-    stops = float(np.median([view.stops for view in readable]))
-    figures = f"{stops:.1f} stops on the object, {100 * clipped:.2g} % of it clipped"
-    if not capture.hdr:
-        if clipped > CLIPPED_MUCH or "exposure_jump" in kinds:
-            return Verdict(
-                "poor",
-                f"display values (sRGB), {figures}: highlights are lost, so gloss and "
-                "light cannot be determined",
-            )
-        return Verdict(
-            "limited",
-            f"display values (sRGB), {figures}: colours can be recovered, gloss and light only roughly",
-        )
-    if "few_levels" in kinds or "exposure_jump" in kinds or clipped > CLIPPED_MUCH:
-        reasons = {"few_levels": "made from 8-bit images", "exposure_jump": "with jumps of the exposure"}
-        why = next((reason for kind, reason in reasons.items() if kind in kinds), "with clipped highlights")
-        return Verdict("poor", f"linear, {figures}, but {why}")
-    if clipped > CLIPPED_A_BIT:
-        return Verdict("limited", f"linear, {figures}: mark clipped pixels in a validity mask")
-    return Verdict("good", f"linear, {figures}: good enough for the estimation of materials")
+        yield Defect("scale", "warning", f"the object is small: {text}", "make the scene box smaller")

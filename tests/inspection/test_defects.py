@@ -1,4 +1,4 @@
-"""Inspection: a good capture has no findings, and each planted defect gives exactly its own finding."""
+"""Inspection finds no defect in a good capture, and exactly the planted one in every other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import neilfpp_method
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.inspection.findings import Inspection, inspect_capture, problems_of_poses
+from neilfpp_method.inspection.defects import Inspection, inspect_capture, problems_of_poses
 from tests.data.make_capture import make_capture, srgb, write_ply
 
 SCENE = Path(neilfpp_method.__file__).parent / "demo" / "scene"
@@ -44,15 +44,15 @@ def capture(tmp_path: Path) -> Capture:
 
 
 def found(of: Capture | Inspection) -> dict[str, tuple[str, ...]]:
-    """The findings' kinds, and the views that they name."""
+    """The defects' kinds, and the views that they name."""
     inspection = inspect_capture(of) if isinstance(of, Capture) else of
-    return {finding.kind: finding.views for finding in inspection.findings}
+    return {defect.kind: defect.views for defect in inspection.defects}
 
 
-def test_the_demo_scene_has_no_findings() -> None:
+def test_the_demo_scene_has_no_defects() -> None:
     inspection = inspect_capture(load_capture(SCENE))
-    assert inspection.findings == ()
-    assert inspection.verdict.quality == "good"
+    assert inspection.defects == ()
+    assert inspection.radiance.level == "good"
     assert np.allclose(inspection.factors, 1, atol=0.25)
 
 
@@ -63,7 +63,7 @@ def test_an_exposure_jump(capture: Capture, stops: float) -> None:
     inspection = inspect_capture(capture)
     assert found(inspection) == {"exposure_jump": (view.name,)}
     assert inspection.factors[VICTIM] == pytest.approx(2.0**stops, rel=0.2)
-    assert inspection.verdict.quality == "poor"
+    assert inspection.radiance.level == "poor"
     known = replace(view, exposure=2.0**stops)
     mended = replace(capture, views=(*capture.views[:VICTIM], known, *capture.views[VICTIM + 1 :]))
     assert found(mended) == {}, "an exposure that is known is no jump"
@@ -111,7 +111,7 @@ def test_clipped_highlights_in_linear_files(capture: Capture) -> None:
     inspection = inspect_capture(capture)
     assert set(found(inspection)) == {"clipped"}
     assert np.allclose([view.clipped for view in inspection.views], shares, atol=0.005)
-    assert inspection.verdict.quality == "poor"
+    assert inspection.radiance.level == "poor"
 
 
 def test_clipped_pixels_that_are_marked_do_not_count(capture: Capture) -> None:
@@ -131,7 +131,7 @@ def test_display_values_in_linear_files(capture: Capture) -> None:
         change(view.image, lambda pixels: np.rint(255 * srgb(pixels)) / 255)
     inspection = inspect_capture(capture)
     assert found(inspection)["few_levels"] == ()
-    assert inspection.verdict.quality == "poor"
+    assert inspection.radiance.level == "poor"
 
 
 def test_broken_pixels_must_be_marked(capture: Capture) -> None:
@@ -184,8 +184,8 @@ def test_points_and_cameras_that_contradict_the_scene_box_are_found(capture: Cap
             -1, 1, (500, 3)
         )
         write_ply(capture.root / "cloud.ply", points, normal)
-        findings = inspect_capture(replace(capture, point_cloud=capture.root / "cloud.ply")).findings
-        assert [(finding.kind, finding.severity) for finding in findings] == [("scale", severity)]
+        defects = inspect_capture(replace(capture, point_cloud=capture.root / "cloud.ply")).defects
+        assert [(defect.kind, defect.severity) for defect in defects] == [("scale", severity)]
     closer = replace(capture.normalization, scale=10 * capture.normalization.scale)
     kinds = found(replace(capture, normalization=closer, point_cloud=None))
     assert len(kinds["camera_inside"]) == len(capture.views)
@@ -195,7 +195,7 @@ def test_points_and_cameras_that_contradict_the_scene_box_are_found(capture: Cap
 def test_clipped_pixels_of_display_values_are_counted(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, views=20, size=(48, 36), hdr=False, masks=True))
     inspection = inspect_capture(capture)
-    assert inspection.verdict.quality == "poor"  # the sphere of the tests is brighter than white
+    assert inspection.radiance.level == "poor"  # the sphere of the tests is brighter than white
     for view, figures in zip(capture.views, inspection.views, strict=True):
         pixels, mask = np.asarray(Image.open(view.image)), np.asarray(Image.open(view.mask)) > 0
         assert figures.clipped == pytest.approx((pixels[mask] == 255).any(-1).mean())
@@ -204,7 +204,7 @@ def test_clipped_pixels_of_display_values_are_counted(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ the command
 
 
-def test_the_command_prints_and_writes_the_findings(capture: Capture, tmp_path: Path, capfd) -> None:
+def test_the_command_prints_and_writes_the_defects(capture: Capture, tmp_path: Path, capfd) -> None:
     view = capture.views[VICTIM]
     change(view.image, lambda pixels: 4 * pixels)
     assert main(["inspect", str(capture.root), "--out", str(tmp_path / "out")]) == 0
@@ -214,7 +214,8 @@ def test_the_command_prints_and_writes_the_findings(capture: Capture, tmp_path: 
     )
     assert "radiance: poor" in said
     written = json.loads((tmp_path / "out" / "inspect.json").read_text())
-    assert [(f["kind"], f["views"]) for f in written["findings"]] == [("exposure_jump", [view.name])]
+    assert written["radiance"]["level"] == "poor"
+    assert [(d["kind"], d["views"]) for d in written["defects"]] == [("exposure_jump", [view.name])]
     assert len(written["views"]) == written["capture"]["views"] == len(capture.views)
     assert (capture.root / written["views"][0]["image"]).is_file()
     picture = np.asarray(Image.open(tmp_path / "out" / "inspect.png"))
