@@ -162,8 +162,17 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
         width=width,
         height=height,
         w2c=pose_from_opengl(frame["transform_matrix"]),
-        lens=lens_from_nerfstudio(model.word(*MODELS) if model else unnamed, distortion, frame.where),
+        lens=lens_from_nerfstudio(_supported(model) if model else unnamed, distortion, frame.where),
     )
+
+
+def _supported(model: Entry) -> str:
+    if model.word() not in MODELS:
+        raise UserError(
+            f"{model.where}: {model.value} is not one of {', '.join(MODELS)}",
+            "undistort the images, or cut panoramas into perspective images",
+        )
+    return model.word()
 
 
 def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple[float, float]:
