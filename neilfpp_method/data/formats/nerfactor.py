@@ -1,23 +1,26 @@
 """Reader of the synthetic scenes of NeRFactor and TensoIR: a folder for each view.
 
-train_<i>/, test_<i>/    one view each; the test views are held out, and val_<i>/ is not read
-  metadata.json            cam_angle_x: horizontal field of view in radians
-                           cam_transform_mat: camera to world, 4×4, OpenGL axes (x right, y up, z back), as
-                             text of 16 numbers with commas
-  rgba.png                 the image, whose alpha channel is the mask; images under other lights, such as
-                             TensoIR's rgba_sunset.png, are not read
+    train_<i>/, test_<i>/    one view each, <i> of three digits
+      metadata.json            cam_angle_x: horizontal field of view in radians
+                               cam_transform_mat: camera to world, 4×4, OpenGL axes (x right, y up, z back),
+                                 as text of 16 numbers with commas
+      rgba.png                 the image, whose alpha channel is the mask
+
+The test views are held out; those without an image are left out. Not read are val_<i>/ and images under other
+lights, such as TensoIR's rgba_sunset.png.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from neilfpp_method.data.formats.places import stored_image
+from neilfpp_method.data.formats.places import stored
 from neilfpp_method.data.formats.transforms import focal_of_angle, pose_from_opengl
 from neilfpp_method.data.images import image_header
 from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
+from neilfpp_method.errors import UserError
 
 __all__ = ["LAYOUT", "read", "recognize"]
 
@@ -37,16 +40,22 @@ def read(root: Path) -> CaptureFiles:
     Raises:
         UserError: a metadata.json is missing or malformed, or an image is missing or outside of the folder.
     """
-    folders = [folder for split in ("train", "test") for folder in sorted(root.glob(f"{split}_[0-9]*"))]
+    train, test = (sorted(root.glob(f"{split}_[0-9]*")) for split in ("train", "test"))
+    folders = [*train, *(folder for folder in test if stored(root, folder / IMAGE))]
     views = tuple(_view(root, i, folder) for i, folder in enumerate(folders))
-    test = frozenset(view.name for view in views if view.name.startswith("test_"))
+    held_out = frozenset(view.name for view in views[len(train) :])
     box = find_box(views)
-    return CaptureFiles(root, views, box.normalization, test=test or None, scene_from=box.source)
+    return CaptureFiles(root, views, box.normalization, test=held_out or None, scene_from=box.source)
 
 
 def _view(root: Path, index: int, folder: Path) -> View:
     entry = Entry.load(inside(root, folder / FILE))
-    image = stored_image(root, folder / IMAGE, entry.where)
+    image = stored(root, folder / IMAGE)
+    if image is None:
+        raise UserError(
+            f"{folder}: there is no {IMAGE}",
+            f"put the image there; of images under several lights, copy those of one light to {IMAGE}",
+        )
     header = image_header(image)
     focal = focal_of_angle(entry["cam_angle_x"], header.width)
     pose = entry["cam_transform_mat"]

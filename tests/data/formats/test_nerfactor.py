@@ -67,6 +67,12 @@ def test_bad_metadata_is_refused(tmp_path: Path, entry: str, value: object, comp
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:
     (scene(tmp_path) / "train_001" / "rgba.png").unlink()
-    refused(tmp_path, "train_001/metadata.json: there is no", "rgba.png")
+    refused(tmp_path, "train_001: there is no rgba.png", "copy those of one light to rgba.png")
     (tmp_path / "train_001" / "metadata.json").unlink()
     refused(tmp_path, "train_001/metadata.json", "No such file")
+
+
+def test_test_views_without_an_image_are_left_out(tmp_path: Path) -> None:
+    """In NeRFactor's scenes only the cameras of some of them are known."""
+    (scene(tmp_path) / "test_000" / "rgba.png").unlink()
+    assert [view.name for view in load_capture(tmp_path).test_views] == ["test_001"]
