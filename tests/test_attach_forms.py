@@ -277,3 +277,16 @@ def test_an_attached_module_can_be_pickled_with_its_host():
         torch.manual_seed(0)
         results.append(each.losses(pixels(), Stage.MATERIAL_INIT).loss)
     assert torch.equal(*results)
+
+
+def test_the_moving_average_of_a_scene_contains_its_host():
+    scene = torch.nn.ModuleDict({"host": Ball()})
+    scene["neilf"] = attach_neilf(scene["host"], tiny_config())
+    average = torch.optim.swa_utils.AveragedModel(scene, avg_fn=lambda mean, new, count: new)
+    with torch.no_grad():
+        scene["host"].radius.fill_(0.4)
+    average.update_parameters(scene)  # the first call copies, the second averages
+    average.update_parameters(scene)
+    rays = ball_rays(8)
+    depths = [each["neilf"].maps(rays).depth for each in (scene, average.module)]
+    assert torch.equal(*depths)

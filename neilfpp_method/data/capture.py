@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from neilfpp_method.data import capture_folder
-from neilfpp_method.data.formats import blender, colmap, dtu, nero, sfm_scene, transforms
+from neilfpp_method.data.formats import blender, colmap, dtu, nerfactor, nero, sfm_scene, transforms
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
 from neilfpp_method.data.raw import RAW_SUFFIXES
 from neilfpp_method.data.views import (
@@ -63,6 +63,7 @@ READERS: Mapping[str, Reader] = {
     "dtu": dtu,
     "transforms": transforms,
     "blender": blender,
+    "nerfactor": nerfactor,
     "colmap": colmap,
     "nero": nero,
 }

@@ -47,7 +47,7 @@ class StepGuard:
         self._step = -1
         self._terms: Mapping[str, Tensor] = {}
         self._optimizers: list[Optimizer] = []
-        self._judged = False
+        self._judged, self._is_finite = False, True
 
     def watch(self, optimizer: Optimizer) -> None:
         """Check the gradients of this and all other watched optimizers before each step of the optimizer."""
@@ -65,21 +65,24 @@ class StepGuard:
         self._terms, self._step, self._judged = terms, step, False
 
     @torch.no_grad()
-    def _before_step(self, *_: object) -> None:
+    def _before_step(self, optimizer: Optimizer, *_: object) -> None:
         """Check a training step once, before the first of its optimizers changes anything.
 
         Raises:
             Diverged: if ten steps in a row were not finite.
         """
-        if self._judged:
-            return
-        self._judged = True
+        if not self._judged:
+            self._judged, self._is_finite = True, self._judge()
+        if not self._is_finite:
+            # Others lose theirs before their own steps: until then a GradScaler reads them.
+            optimizer.zero_grad(set_to_none=True)
+
+    def _judge(self) -> bool:
+        """Whether the losses and gradients of this step are finite; counts and reports a step that is not."""
         name = self._first_not_finite()
         if name is None:
             self._in_a_row = 0
-            return
-        for optimizer in self._optimizers:
-            optimizer.zero_grad(set_to_none=True)
+            return True
         self.skipped += 1
         self._in_a_row += 1
         self.warn(f"step {self._step} skipped: {name} is not finite ({self.skipped} skipped so far)")
@@ -89,6 +92,7 @@ class StepGuard:
                 "go back to the last good checkpoint; look at the brightest pixels or lower the learning "
                 "rates",
             )
+        return False
 
     def _first_not_finite(self) -> str | None:
         """The name of a loss or gradient that is not finite, or None; needs one transfer from the device."""

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
@@ -50,7 +53,8 @@ class MeshHost(nn.Module):
     """A triangle mesh and R on it. Only R and the background are trained.
 
     Faces are oriented outwards. The inside of a face stops a ray but is not a hit. Checkpoints do not contain
-    the mesh.
+    the mesh, but a hash of its triangles: R is a function of position, and on another surface its values have
+    no meaning.
 
     Args:
         mesh: triangles in the scene frame.
@@ -76,6 +80,24 @@ class MeshHost(nn.Module):
         self.offset = config.ray_offset
         self.normal_radius = config.volume.normal_radius
         self._tracers: dict[torch.device, FirstHits] = {}
+        self._hash = _hash_of(triangles)
+        self.register_load_state_dict_post_hook(_accept_without_hash)
+
+    def get_extra_state(self) -> UInt8[Tensor, " 32"]:
+        """The hash of the triangles, for a checkpoint."""
+        return self._hash
+
+    def set_extra_state(self, state: UInt8[Tensor, " 32"]) -> None:
+        """Check the hash in a checkpoint.
+
+        Raises:
+            UserError: the checkpoint was trained on another mesh.
+        """
+        if not torch.equal(state.cpu(), self._hash):
+            raise UserError(
+                "the mesh is not the one that the run was trained on, or the scene frame has changed",
+                "restore the file of the mesh and capture.json of the run, or train again",
+            )
 
     # -------------------------------------------------------------------------------------- the host contract
 
@@ -169,6 +191,16 @@ class MeshHost(nn.Module):
         missed = torch.nonzero(torch.ones_like(rays.origins[:, 0]).index_fill(0, hit_rows, 0.0))[:, 0]
         radiance = self.background(rays.origins[missed], rays.directions[missed])
         return radiance.new_zeros(len(rays), 3).index_put((missed,), radiance)
+
+
+def _hash_of(triangles: Float[Tensor, "F 3 3"]) -> UInt8[Tensor, " 32"]:
+    digest = hashlib.sha256(triangles.numpy().tobytes()).digest()
+    return torch.tensor(list(digest), dtype=torch.uint8)
+
+
+def _accept_without_hash(_: nn.Module, keys: Any) -> None:
+    """Load checkpoints that were written before they had a hash."""
+    keys.missing_keys[:] = [key for key in keys.missing_keys if not key.endswith("_extra_state")]
 
 
 def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3 3"]:

@@ -21,6 +21,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -257,7 +258,7 @@ def read_description(path: Path) -> Description:
     """Read the description of a run.
 
     Raises:
-        UserError: if the folder is no run, or a run of another version.
+        UserError: if the folder is no run, a run of another version, or has a damaged file.
     """
     if not (path / "config.json").is_file():
         missing = (
@@ -271,11 +272,23 @@ def read_description(path: Path) -> Description:
             f"{FORMAT}",
             "use the version of neilfpp that wrote it, or train again",
         )
+    source = _parse(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json"))
+    _check_frame(source, path / "capture.json")
     return Description(
         _parse(NeilfConfig, stored.get("config"), f"{path / 'config.json'}: config"),
-        _parse(CaptureSource, read_json(path / "capture.json"), str(path / "capture.json")),
+        source,
         _parse(SceneFacts, read_json(path / "scene.json"), str(path / "scene.json")),
     )
+
+
+def _check_frame(source: CaptureSource, where: Path) -> None:
+    """Raise a `UserError` if the scene frame is impossible: the file may have been edited by hand."""
+    unit, center = source.unit, source.center
+    given = unit is not None and center is not None
+    if given and (not 0.0 < unit < math.inf or not all(map(math.isfinite, center))):
+        raise UserError(f"{where}: unit is not positive, or center not finite", "restore the file")
+    if not given and (unit, center) != (None, None):
+        raise UserError(f"{where}: only one of unit and center is given", "restore the file")
 
 
 Part = TypeVar("Part")

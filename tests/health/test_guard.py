@@ -85,3 +85,23 @@ def test_an_optimizer_watched_twice_is_checked_once():
     guard, said = guarded([*optimizers, *optimizers])
     step(guard, optimizers, one.sum() * torch.nan)
     assert len(said) == 1
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_gradient_scaler_finds_the_gradients_that_it_checks(first: int):
+    """The gradient of one of two optimizers is too large for two steps."""
+    one, other, optimizers = two_fields()
+    guard, said = guarded(optimizers)
+    scaler = torch.amp.GradScaler("cpu", init_scale=2.0**16)
+    for number, factor in enumerate((torch.inf, torch.inf, 4.0)):
+        loss = one.sum() + factor * other.sum()
+        guard.begin_step({}, number)
+        for optimizer in optimizers:
+            optimizer.zero_grad()
+        scaler.scale(loss).backward()
+        for optimizer in (optimizers[first], optimizers[1 - first]):
+            scaler.step(optimizer)
+        scaler.update()
+        assert [not torch.equal(field, torch.ones(2)) for field in (one, other)] == [number == 2] * 2
+    assert scaler.get_scale() == 2.0**14
+    assert len(said) == guard.skipped == 2

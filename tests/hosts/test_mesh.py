@@ -15,6 +15,7 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.errors import UserError
 from neilfpp_method.hosts import mesh_tracing
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, tree_tracer
@@ -25,6 +26,7 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import RayBatch
+from tests.calls import refused
 from tests.data.make_capture import CENTER, make_capture
 from tests.scenes import sphere_batch, tiny_config
 from tests.train.small_runs import small_config
@@ -344,6 +346,16 @@ def test_a_mesh_run_from_the_command_line(tmp_path: Path, monkeypatch, capsys):
     assert mesh.visual.vertex_colors.shape == (len(mesh.vertices), 4)
 
 
+def test_weights_belong_to_one_mesh():
+    ball, egg = mesh_host(SPHERE), mesh_host(SPHERE.copy().apply_scale([1.0, 1.0, 1.1]))
+    weights = ball.state_dict()
+    mesh_host(SPHERE).load_state_dict(weights)
+    with pytest.raises(UserError, match="not the one that the run was trained on"):
+        egg.load_state_dict(weights)
+    # Checkpoints of earlier versions have no hash.
+    egg.load_state_dict({name: value for name, value in weights.items() if "extra_state" not in name})
+
+
 def test_a_mesh_is_given_by_its_path_and_loaded_again(tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setitem(PRESETS, "tiny", small_config)
     capture = make_capture(tmp_path / "sphere")
@@ -374,6 +386,18 @@ def test_a_mesh_is_given_by_its_path_and_loaded_again(tmp_path: Path, monkeypatc
     assert json.loads((out / "config.json").read_text())["config"]["host"]["path"] == str(
         tmp_path / "scan.ply"
     )
+
+    # R was trained on this surface, so neither another one nor another scene frame is accepted.
+    given, source = (tmp_path / "scan.ply").read_bytes(), (out / "capture.json").read_text()
+    trimesh.Trimesh(shape.vertices * [1, 1, 1.01], shape.faces, process=False).export(tmp_path / "scan.ply")
+    for command in (["eval", out], ["export", out], ["render", out], ["relight", out]):
+        refused(capsys, [*command, "--device", "cpu"], "not the one that the run was trained on", leaves=out)
+    (tmp_path / "scan.ply").write_bytes(given)
+    moved = json.loads(source)
+    (out / "capture.json").write_text(json.dumps({**moved, "unit": 1.5 * moved["unit"]}))
+    refused(capsys, ["eval", out, "--device", "cpu"], "the scene frame has changed", leaves=out)
+    (out / "capture.json").write_text(source)
+
     (tmp_path / "scan.ply").unlink()
     assert main(["eval", str(out), "--device", "cpu"]) == 2
     assert "scan.ply: there is no such mesh" in capsys.readouterr().err

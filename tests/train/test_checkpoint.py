@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import platform
 from importlib import metadata
@@ -229,6 +230,18 @@ def change(path: Path, **values) -> None:
         ("config.json", {"config": {"brdf": 3}}, "config.brdf: 3 where settings belong"),
         ("capture.json", {"drive": "B:"}, r"capture\.json: unknown setting 'drive'"),
         ("capture.json", {"response": "log"}, r"capture\.json\.response: 'log' is not a choice"),
+        ("capture.json", {"unit": 0.0, "center": [0.0, 0.0, 0.0]}, r"capture\.json: unit is not positive"),
+        (
+            "capture.json",
+            {"unit": math.nan, "center": [0.0, 0.0, 0.0]},
+            r"capture\.json: unit is not positive",
+        ),
+        (
+            "capture.json",
+            {"unit": 1.0, "center": [0.0, 0.0, math.inf]},
+            r"capture\.json: .* center not finite",
+        ),
+        ("capture.json", {"unit": 1.0}, r"capture\.json: only one of unit and center is given"),
         ("scene.json", {"moon": 1}, r"scene\.json: unknown setting 'moon'"),
     ],
 )

@@ -13,6 +13,7 @@ Images are used as they are: a lens keeps its distortion, and rays are bent inst
 
 from __future__ import annotations
 
+from glob import escape
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,7 @@ def read(root: Path) -> CaptureFiles:
     first = names[0]
     inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
     if inputs is None:
+        _check_spaces(root, folder, first)
         raise UserError(
             f"{root}: there is no images/{first}", "put the images of the model into the folder images"
         )
@@ -139,6 +141,17 @@ def model_folder(root: Path) -> Path | None:
         if numbered:
             return max(sorted(numbered), key=lambda folder: _model_size(root, folder))
     return next((root / place for place in MODELS if _model_files(root / place)), None)
+
+
+def _check_spaces(root: Path, model: Path, first: str) -> None:
+    """Raise a `UserError` if a text model has cut off the name of its first image at a space."""
+    is_text = _model_files(model)[0].suffix == ".txt"
+    whole = [file for place in IMAGE_FOLDERS for file in (root / place).glob(f"{escape(first)} *")]
+    if is_text and whole:
+        raise UserError(
+            f"{model}: names of images end at their first space in a text model, as {first!r}",
+            "export the model as binary, or rename the images and reconstruct again",
+        )
 
 
 def _model_files(folder: Path) -> list[Path]:

@@ -37,7 +37,16 @@ from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
 from neilfpp_method.errors import UserError
 
-__all__ = ["FLIP", "LAYOUT", "Frame", "read", "read_frames", "recognize"]
+__all__ = [
+    "FLIP",
+    "LAYOUT",
+    "Frame",
+    "focal_of_angle",
+    "pose_from_opengl",
+    "read",
+    "read_frames",
+    "recognize",
+]
 
 LAYOUT = "transforms.json"
 FLIP = np.array([1.0, -1.0, -1.0, 1.0])
@@ -152,9 +161,18 @@ def _camera(entry: Entry, frame: Entry, image: Path) -> Camera:
         cy=height / 2 if cy is None else cy,
         width=width,
         height=height,
-        w2c=_pose(frame["transform_matrix"]),
-        lens=lens_from_nerfstudio(model.word(*MODELS) if model else unnamed, distortion, frame.where),
+        w2c=pose_from_opengl(frame["transform_matrix"]),
+        lens=lens_from_nerfstudio(_supported(model) if model else unnamed, distortion, frame.where),
     )
+
+
+def _supported(model: Entry) -> str:
+    if model.word() not in MODELS:
+        raise UserError(
+            f"{model.where}: {model.value} is not one of {', '.join(MODELS)}",
+            "undistort the images, or cut panoramas into perspective images",
+        )
+    return model.word()
 
 
 def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple[float, float]:
@@ -166,7 +184,7 @@ def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple
 
     def focal(place: Entry, axis: str, size: int) -> float | None:
         length, angle = place.get(f"fl_{axis}"), place.get(f"camera_angle_{axis}")
-        from_angle = None if angle is None else _focal(angle, size)
+        from_angle = None if angle is None else focal_of_angle(angle, size)
         return (length and length.number()) or from_angle
 
     # Angles that are not used are checked as well: a wrong one may mean that the lengths are wrong, too.
@@ -184,15 +202,24 @@ def _focal_lengths(entry: Entry, frame: Entry, width: int, height: int) -> tuple
     return fx, fy or fx
 
 
-def _focal(entry: Entry, size: int) -> float:
+def focal_of_angle(entry: Entry, size: int) -> float:
+    """Return the focal length in pixels from an angle of view in radians across `size` pixels.
+
+    Raises:
+        UserError: the entry is not an angle between 0 and π.
+    """
     angle = entry.number()
     if not 0 < angle < np.pi:
         raise UserError(f"{entry.where}: {angle:g} is no angle of view", "give radians, above 0 and below π")
     return size / (2 * np.tan(angle / 2))
 
 
-def _pose(entry: Entry) -> Float64[np.ndarray, "4 4"]:
-    """Convert a rigid pose from camera to world with OpenGL axes into world to camera with OpenCV axes."""
+def pose_from_opengl(entry: Entry) -> Float64[np.ndarray, "4 4"]:
+    """Convert a rigid pose from camera to world with OpenGL axes into world to camera with OpenCV axes.
+
+    Raises:
+        UserError: the entry is no 4×4 or 3×4 matrix of a rotation and a translation.
+    """
     c2w = entry.numbers((4, 4), (3, 4))[:3]
     rotation = c2w[:, :3] * FLIP[:3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:

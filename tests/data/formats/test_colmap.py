@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -257,6 +258,18 @@ def test_a_frame_without_its_image(tmp_path: Path) -> None:
     path = tmp_path / "sparse" / "0" / "images.txt"
     path.write_text("\n".join(line for line in path.read_text().splitlines() if "004.png" not in line) + "\n")
     refused(tmp_path, "sparse", "image 5 in frame 5 does not exist")
+
+
+def test_names_with_spaces_in_a_text_model(tmp_path: Path) -> None:
+    """COLMAP writes the whole name and reads it up to the first space."""
+    names = [f"view {i:03d}.exr" for i in range(VIEWS)]
+    root = write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE"), names), text=True)
+    for file in (root / "images").iterdir():
+        file.rename(file.with_name(f"view {file.name}"))
+    refused(root, "end at their first space in a text model, as 'view'; export the model as binary")
+    shutil.rmtree(root / "sparse")
+    write(root, reconstruction(colmap_camera("PINHOLE"), names))
+    assert [view.name for view in load_capture(root).views] == [f"view {i:03d}" for i in range(VIEWS)]
 
 
 def test_a_name_that_is_not_utf_8(tmp_path: Path) -> None:

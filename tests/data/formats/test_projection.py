@@ -160,7 +160,8 @@ WRITERS: dict[str, Callable[[Path, list[np.ndarray], np.ndarray], None]] = {
 
 
 def test_every_layout_is_tested() -> None:
-    assert list(WRITERS) == list(READERS)
+    # The cameras of `nerfactor` have their principal point in the centre: test_nerfactor.py.
+    assert list(WRITERS) == [layout for layout in READERS if layout != "nerfactor"]
 
 
 @pytest.mark.parametrize("world", WORLDS)

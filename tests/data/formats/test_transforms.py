@@ -275,7 +275,10 @@ def frame(content: dict) -> dict:
         (lambda c: c.update(w=12.5), ["w: not a positive whole number"]),
         (lambda c: c.update(w=1e400), ["w: not a finite number"]),
         (lambda c: c.update(w=48), ["24×18 pixels where the camera has 48×18"]),
-        (lambda c: c.update(camera_model="EQUIRECTANGULAR"), ["camera_model: not OPENCV or"]),
+        (
+            lambda c: c.update(camera_model="EQUIRECTANGULAR"),
+            ["camera_model: EQUIRECTANGULAR is not one of OPENCV, ", "cut panoramas into perspective images"],
+        ),
         (lambda c: c.update(k4=0.1), ["k4 is not supported for the camera model OPENCV"]),
         (lambda c: c.update(k6=0.1), ["k6 is not supported for the camera model OPENCV"]),
         (
