@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor, nn
@@ -29,6 +28,10 @@ from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
 
 __all__ = ["MeshHost", "corner_normals"]
 
+SAME_MESH = 1e-6
+"""Difference of fingerprints up to which two meshes are the same. Rounding on another processor changes them
+by about 1e-8.
+"""
 TINY = 1e-18
 """Length below which a cross product of edges has no direction; tiny, as triangles may be small."""
 CREASE = math.radians(40)
@@ -53,8 +56,8 @@ class MeshHost(nn.Module):
     """A triangle mesh and R on it. Only R and the background are trained.
 
     Faces are oriented outwards. The inside of a face stops a ray but is not a hit. Checkpoints do not contain
-    the mesh, but a hash of its triangles: R is a function of position, and on another surface its values have
-    no meaning.
+    the mesh, but the number and moments of its corners: R is a function of position, and on another surface
+    its values have no meaning.
 
     Args:
         mesh: triangles in the scene frame.
@@ -80,20 +83,20 @@ class MeshHost(nn.Module):
         self.offset = config.ray_offset
         self.normal_radius = config.volume.normal_radius
         self._tracers: dict[torch.device, FirstHits] = {}
-        self._hash = _hash_of(triangles)
-        self.register_load_state_dict_post_hook(_accept_without_hash)
+        self._fingerprint = _fingerprint(triangles)
+        self.register_load_state_dict_post_hook(_accept_without_fingerprint)
 
-    def get_extra_state(self) -> UInt8[Tensor, " 32"]:
-        """The hash of the triangles, for a checkpoint."""
-        return self._hash
+    def get_extra_state(self) -> Float64[Tensor, " 10"]:
+        """The fingerprint of the triangles, for a checkpoint."""
+        return self._fingerprint
 
-    def set_extra_state(self, state: UInt8[Tensor, " 32"]) -> None:
-        """Check the hash in a checkpoint.
+    def set_extra_state(self, state: Float64[Tensor, " 10"]) -> None:
+        """Check the fingerprint in a checkpoint.
 
         Raises:
             UserError: the checkpoint was trained on another mesh.
         """
-        if not torch.equal(state.cpu(), self._hash):
+        if not torch.allclose(state.cpu(), self._fingerprint, rtol=SAME_MESH, atol=SAME_MESH):
             raise UserError(
                 "the mesh is not the one that the run was trained on, or the scene frame has changed",
                 "restore the file of the mesh and capture.json of the run, or train again",
@@ -193,13 +196,18 @@ class MeshHost(nn.Module):
         return radiance.new_zeros(len(rays), 3).index_put((missed,), radiance)
 
 
-def _hash_of(triangles: Float[Tensor, "F 3 3"]) -> UInt8[Tensor, " 32"]:
-    digest = hashlib.sha256(triangles.numpy().tobytes()).digest()
-    return torch.tensor(list(digest), dtype=torch.uint8)
+def _fingerprint(triangles: Float[Tensor, "F 3 3"]) -> Float64[Tensor, " 10"]:
+    """The number of triangles, and the first and second moments of their corners, scene frame.
+
+    A hash would also change with the rounding of another processor.
+    """
+    corner = triangles.double().reshape(-1, 3)
+    second = (corner[:, [0, 1, 2, 0, 0, 1]] * corner[:, [0, 1, 2, 1, 2, 2]]).mean(0)
+    return torch.cat((torch.tensor([float(len(triangles))]).double(), corner.mean(0), second))
 
 
-def _accept_without_hash(_: nn.Module, keys: Any) -> None:
-    """Load checkpoints that were written before they had a hash."""
+def _accept_without_fingerprint(_: nn.Module, keys: Any) -> None:
+    """Load checkpoints that were written before they had a fingerprint."""
     keys.missing_keys[:] = [key for key in keys.missing_keys if not key.endswith("_extra_state")]
 
 

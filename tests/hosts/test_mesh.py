@@ -352,7 +352,7 @@ def test_weights_belong_to_one_mesh():
     mesh_host(SPHERE).load_state_dict(weights)
     with pytest.raises(UserError, match="not the one that the run was trained on"):
         egg.load_state_dict(weights)
-    # Checkpoints of earlier versions have no hash.
+    # Checkpoints of earlier versions have no fingerprint.
     egg.load_state_dict({name: value for name, value in weights.items() if "extra_state" not in name})
 
 
