@@ -387,4 +387,18 @@ MUTANTS: Sequence[Mutant] = (
         "if True:",
         "train/test_not_finite.py",
     ),
+    Mutant(
+        "evaluation in a training skips the empty space of an earlier geometry",
+        "hosts/volsdf.py",
+        "self._evaluation_space = None",
+        "pass",
+        "hosts/test_skip_empty.py",
+    ),
+    Mutant(
+        "in a short training geometry does not wait for R",
+        "train/optimizer.py",
+        "min(MIN_WAIT, position.length / 2)",
+        "0",
+        "train/test_start.py",
+    ),
 )
