@@ -79,7 +79,8 @@ def main(options: Options, console: Console) -> None:
     for folder in options.folders:
         capture, runs = folder.name.removeprefix("frontier-"), read_runs(folder)
         rows += frontier_rows(capture, runs)
-        figure = draw_frontier(f"{capture}, fast", frontier(runs))
+        title = read_json(folder / "tradeoff.json")["title"]
+        figure = draw_frontier(title, frontier(runs))
         (ROOT / "docs" / f"frontier_{capture}.svg").write_text(figure, "utf-8")
     result = Result("frontier", options.commit, options.command, options.machine, tuple(rows))
     write_result(RESULTS / "frontier.json", result)

@@ -65,7 +65,10 @@ class RegularizerInputs:
 
 @dataclass(frozen=True)
 class EvaluationSpace:
-    """Empty space of a G that is not being trained, and the versions of the parameters that G had then."""
+    """Empty space of a G that is not being trained, and the versions of the parameters that G had then.
+
+    The versions show that weights were loaded. They do not show every training step (`VolSdfHost._march`).
+    """
 
     versions: list[tuple[int, int]]
     space: EmptySpace

@@ -9,7 +9,7 @@ Approach to True Multi-Image Matching, CVPR 1996). OpenCV does the warping and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.undistort import resample, straight_camera
-from neilfpp_method.data.views import Camera, Normalization, View
+from neilfpp_method.data.views import Camera, Normalization, View, scaled_camera
 from neilfpp_method.shading.color import luminance
 
 __all__ = ["GrayView", "choose_sources", "gray_view", "inverse_depth_step", "sweep"]
@@ -102,16 +102,7 @@ def gray_view(view: View, linear: bool) -> GrayView:
     width, height = round(camera.width * scale), round(camera.height * scale)
     if (width, height) != (camera.width, camera.height):
         gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
-        scale_x, scale_y = width / camera.width, height / camera.height
-        camera = replace(
-            camera,
-            fx=camera.fx * scale_x,
-            fy=camera.fy * scale_y,
-            cx=camera.cx * scale_x,
-            cy=camera.cy * scale_y,
-            width=width,
-            height=height,
-        )
+        camera = scaled_camera(camera, width, height)
     return GrayView(camera, np.ascontiguousarray(gray, np.float32))
 
 
