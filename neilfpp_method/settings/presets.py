@@ -83,8 +83,6 @@ def paper_ngp() -> NeilfConfig:
 PAPER_NGP_HDR: Mapping[str, Any] = {
     "preset": "paper-ngp-hdr",
     "background.kind": "inverted_sphere",
-    "background.layers": 2,
-    "background.width": 64,
     "loss.surface": 1e-3,
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,
@@ -125,8 +123,6 @@ FAST: Mapping[str, Any] = {
         "environment_height": 48,
         "fit": {"every": 150},
     },
-    "background.layers": 2,
-    "background.width": 64,
     "background.samples": 16,
     "volume.radius": 1.75,
     "volume.beta_init": 0.05,

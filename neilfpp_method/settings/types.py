@@ -171,10 +171,6 @@ class BackgroundConfig:
     """Linear RGB of a constant background, and initial colour of inverted_sphere. If not given, it is taken
     from the image borders.
     """
-    layers: int = 8
-    """Number of hidden layers of the NeRF++ field."""
-    width: int = 256
-    """Units per hidden layer of the NeRF++ field."""
     samples: int = 32
     """Samples per ray beyond the scene sphere."""
 
