@@ -215,7 +215,6 @@ BEST: Mapping[str, Any] = {
     "volume.samples": 64,
     "shading.train_samples": 128,
     "light.fit.every": 500,
-    "light.fit.steps": 200,
     "train.sdf_steps": 10_000,
     "train.material_steps": 8_000,
     "train.joint_steps": 2_000,

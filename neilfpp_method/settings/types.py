@@ -112,8 +112,6 @@ class LightFitConfig:
     """Surface points that the light is fitted to. Memory and time grow with points times texels."""
     every: int = 100
     """Training steps between two fits."""
-    steps: int = 100
-    """Optimization steps of a fit."""
 
 
 @dataclass(frozen=True)

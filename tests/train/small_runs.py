@@ -47,7 +47,7 @@ def solved_light(config: NeilfConfig) -> NeilfConfig:
     visibility.
     """
     fast = preset("fast")
-    fit = dataclasses.replace(fast.light.fit, points=32, every=3, steps=5)
+    fit = dataclasses.replace(fast.light.fit, points=32, every=3)
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
