@@ -128,8 +128,6 @@ FAST: Mapping[str, Any] = {
     "volume.beta_init": 0.05,
     "volume.beta_final": 0.002,
     "volume.skip_empty": True,
-    "volume.initial_samples": 64,
-    "volume.rounds": 2,
     "volume.samples": 32,
     "volume.normal_radius": 0.08,
     "shading.lobe": "ggx",

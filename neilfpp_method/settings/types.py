@@ -211,13 +211,9 @@ class VolumeConfig:
     beta_final: float = 0.0
     """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound."""
     skip_empty: bool = False
-    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation."""
-    initial_samples: int = 128
-    """SDF queries per ray in the first round of the sampler and in each refinement round. Rays that skip
-    empty space use half as many, as the rest of them is short.
+    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation.
+    The sampler then queries the SDF less often, as the rest of a ray is short.
     """
-    rounds: int = 5
-    """Maximum number of refinement rounds of the sampler."""
     samples: int = 98
     """Rendered samples per ray: two thirds by opacity, the rest spread over the whole ray with both ends."""
     normal_radius: float = 0.0

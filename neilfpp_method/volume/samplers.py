@@ -11,7 +11,7 @@ Without the latter a ray that grazes a surface would be rendered too opaque.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -28,8 +28,10 @@ from neilfpp_method.volume.intersect import Interval
 __all__ = [
     "OPACITY_ERROR",
     "ErrorBoundedSamples",
+    "SampleCounts",
     "error_bounded_samples",
     "inverse_cdf_samples",
+    "sample_counts",
     "uniform_samples",
 ]
 
@@ -41,6 +43,11 @@ BISECTIONS = 10
 
 SPREAD = 1 / 3
 """Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
+
+CUTS, ROUNDS = 128, 5
+"""Cuts per ray in each round, and maximum number of refinement rounds (VolSDF Algorithm 1)."""
+SKIPPING_CUTS, SKIPPING_ROUNDS = 64, 2
+"""The same if rays skip empty space: what is left of them is short."""
 
 
 # -------------------------------------------------------------------------------------------- simple samplers
@@ -157,7 +164,7 @@ def bound_shares(partition: Partition, beta: Float[Tensor, "N 1"]) -> Float[Tens
 
 
 def bounded_beta(
-    partition: Partition, beta: Float[Tensor, "#N 1"], beta_plus: Float[Tensor, "N 1"], config: VolumeConfig
+    partition: Partition, beta: Float[Tensor, "#N 1"], beta_plus: Float[Tensor, "N 1"]
 ) -> Float[Tensor, "N 1"]:
     """The smallest scale in [β, β₊] for which the bound is ≤ ε, by bisection; β₊ if there is none.
 
@@ -172,6 +179,32 @@ def bounded_beta(
 
 
 # ---------------------------------------------------------------------------------- the error-bounded sampler
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """Numbers of samples per ray.
+
+    Attributes:
+        cuts: SDF queries in the first round of the sampler and in each refinement round.
+        rounds: maximum number of refinement rounds.
+        rendered: samples that are rendered.
+    """
+
+    cuts: int
+    rounds: int
+    rendered: int
+
+    def of_narrowed_rays(self) -> SampleCounts:
+        """The counts for rays of which only the part that is not empty is sampled: half as many cuts."""
+        return replace(self, cuts=self.cuts // 2)
+
+
+def sample_counts(config: VolumeConfig) -> SampleCounts:
+    """The counts that suit the settings, for whole rays."""
+    if config.skip_empty:
+        return SampleCounts(SKIPPING_CUTS, SKIPPING_ROUNDS, config.samples)
+    return SampleCounts(CUTS, ROUNDS, config.samples)
 
 
 @dataclass(frozen=True)
@@ -196,12 +229,12 @@ def error_bounded_samples(
     rays: RayBatch,
     interval: Interval,
     beta: Float[Tensor, ""],
-    config: VolumeConfig,
+    counts: SampleCounts,
     stochastic: bool,
 ) -> ErrorBoundedSamples:
     """Sample rays so that the error of the opacity is at most ε (`OPACITY_ERROR`; VolSDF Algorithm 1).
 
-    A ray is cut uniformly. Then up to `config.rounds` times cuts are added where they lower the error bound
+    A ray is cut uniformly. Then up to `counts.rounds` times cuts are added where they lower the error bound
     most (`bound_shares`), until the bound at β is ≤ ε. Each round queries the SDF at the new cuts only. A ray
     whose rounds are used up is sampled with the smallest scale β₊ > β for which the bound is ≤ ε.
 
@@ -213,22 +246,22 @@ def error_bounded_samples(
         rays: the rays.
         interval: distances at which rays enter and leave the scene; near = far for a ray that misses it.
         beta: scale β of the density, scene units.
-        config: `initial_samples`, `rounds` and `samples` are used.
+        counts: numbers of samples per ray.
         stochastic: whether the cuts and the samples are random; if False, they are central.
     """
-    near, count = interval.near, len(rays)
+    near, number = interval.near, len(rays)
     beta = beta.to(near.dtype).reshape(1, 1)
-    samples = near.new_empty(count, config.samples)
+    samples = near.new_empty(number, counts.rendered)
     error_bound = torch.empty_like(near)
 
-    rows = torch.arange(count, device=near.device)
-    partition = first_cuts(sdf, rays, interval, config.initial_samples, stochastic)
+    rows = torch.arange(number, device=near.device)
+    partition = first_cuts(sdf, rays, interval, counts.cuts, stochastic)
     queries = partition.distances.numel()
     # The bound at this scale is ≤ ε even if the surface touched every interval (VolSDF Lemma 2).
     worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
     beta_plus = torch.maximum(worst, beta)
 
-    for rounds_left in reversed(range(config.rounds + 1)):
+    for rounds_left in reversed(range(counts.rounds + 1)):
         log_bound = log_error_bound(partition, beta)
         error_bound[rows] = log_bound[:, 0].exp().clamp_max(1.0)
         converged = log_bound <= math.log(OPACITY_ERROR)
@@ -236,18 +269,18 @@ def error_bounded_samples(
         if can_leave_early(near.device):
             done, left = converged[:, 0], ~converged[:, 0]
             samples[rows[done]] = opacity_samples(
-                partition[done], beta_plus[done], config.samples, stochastic
+                partition[done], beta_plus[done], counts.rendered, stochastic
             )
             rows, rays, partition, beta_plus = rows[left], rays[left], partition[left], beta_plus[left]
-        beta_plus = bounded_beta(partition, beta, beta_plus, config)
+        beta_plus = bounded_beta(partition, beta, beta_plus)
         if rounds_left == 0 or len(rows) == 0:
             break
         shares = bound_shares(partition, beta_plus)
-        partition = with_cuts(sdf, rays, partition, shares, config.initial_samples, stochastic)
-        queries += len(rows) * config.initial_samples
+        partition = with_cuts(sdf, rays, partition, shares, counts.cuts, stochastic)
+        queries += len(rows) * counts.cuts
 
-    samples[rows] = opacity_samples(partition, beta_plus, config.samples, stochastic)
-    return ErrorBoundedSamples(samples, error_bound, queries / max(count, 1))
+    samples[rows] = opacity_samples(partition, beta_plus, counts.rendered, stochastic)
+    return ErrorBoundedSamples(samples, error_bound, queries / max(number, 1))
 
 
 def can_leave_early(device: torch.device) -> bool:

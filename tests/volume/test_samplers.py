@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.stats import chisquare, kstest, laplace
 
-from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
@@ -19,15 +19,17 @@ from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
     SPREAD,
+    SampleCounts,
     cut,
     error_bounded_samples,
     inverse_cdf_samples,
+    sample_counts,
     uniform_samples,
 )
 from tests.scenes import sphere_distance
 
 F64 = torch.float64
-CONFIG = VolumeConfig()
+COUNTS = SampleCounts(cuts=128, rounds=5, rendered=98)
 TILT = torch.tensor([0.36, 0.48, 0.8], dtype=F64)  # a unit vector
 
 
@@ -58,11 +60,11 @@ def ray_bundle(count, dtype=F64):
     )
 
 
-def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
+def sample(sdf, rays, beta, counts=COUNTS, stochastic=False):
     origins, directions, near, far = rays
     beta = torch.tensor(beta, dtype=near.dtype)
     interval = Interval(near, far)
-    return error_bounded_samples(sdf, RayBatch(origins, directions), interval, beta, config, stochastic)
+    return error_bounded_samples(sdf, RayBatch(origins, directions), interval, beta, counts, stochastic)
 
 
 # -------------------------------------------------------------------------------------------- simple samplers
@@ -189,7 +191,7 @@ def opacity_error(sdf, rays, beta, cuts):
 @pytest.mark.parametrize("beta", [0.1, 0.02, 0.005])
 @pytest.mark.parametrize("rounds", [0, 5])
 def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta, rounds):
-    config = dataclasses.replace(CONFIG, rounds=rounds)
+    counts = dataclasses.replace(COUNTS, rounds=rounds)
     bundle = ray_bundle(4)
     for i in range(4):
         ray = [part[i : i + 1] for part in bundle]
@@ -199,15 +201,22 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
             asked.append((x - ray[0]) @ ray[1][0])
             return sdf(x)
 
-        found = sample(recorded, ray, beta, config)
+        found = sample(recorded, ray, beta, counts)
         error = opacity_error(sdf, ray, beta, torch.cat(asked).sort().values)
         assert error <= found.error_bound.item() + 1e-5
         if rounds:
             assert found.error_bound.item() <= OPACITY_ERROR
 
 
+def test_rays_that_skip_empty_space_are_cut_less_often():
+    skipping = sample_counts(preset("fast").volume)
+    assert skipping == SampleCounts(cuts=64, rounds=2, rendered=32)
+    assert skipping.of_narrowed_rays() == SampleCounts(cuts=32, rounds=2, rendered=32)
+    assert sample_counts(preset("paper-mlp").volume) == COUNTS
+
+
 def test_the_bound_shows_when_the_rounds_were_too_few():
-    found = sample(sphere_distance, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
+    found = sample(sphere_distance, ray_bundle(16), 1e-4, dataclasses.replace(COUNTS, rounds=0))
     assert (found.error_bound > OPACITY_ERROR).any()
     assert found.distances.isfinite().all()
 
@@ -260,7 +269,7 @@ def test_samples_follow_the_true_opacity():
     origins, directions = torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
     rays = (origins, directions, torch.zeros(1, dtype=F64), torch.full((1,), 4.0, dtype=F64))
     beta = 0.1
-    found = sample(lambda x: 1.0 - x[:, 2], rays, beta, dataclasses.replace(CONFIG, samples=512))
+    found = sample(lambda x: 1.0 - x[:, 2], rays, beta, dataclasses.replace(COUNTS, rendered=512))
     t = found.distances[0].numpy()
     # The antiderivative of Ψ(t − 1)/β: ½ e^{(t−1)/β} before the plane, ½ e^{−(t−1)/β} + (t − 1)/β behind it.
     depth = np.where(t < 1, 0.5 * np.exp((t - 1) / beta), 0.5 * np.exp(-(t - 1) / beta) + (t - 1) / beta)
@@ -337,6 +346,6 @@ def test_samples_have_no_gradient():
     beta = torch.tensor(0.02, dtype=F64, requires_grad=True)
     origins, directions, near, far = ray_bundle(2)
     rays, interval = RayBatch(origins, directions), Interval(near, far)
-    found = error_bounded_samples(sphere_distance, rays, interval, beta, CONFIG, True)
+    found = error_bounded_samples(sphere_distance, rays, interval, beta, COUNTS, True)
     assert not found.distances.requires_grad
     assert not found.error_bound.requires_grad
