@@ -1,7 +1,7 @@
-"""Samplers of distances along rays: uniform, by a distribution, or with bounded opacity error (VolSDF §3).
+"""The sampler of distances along rays, with bounded opacity error (VolSDF §3).
 
-The error-bounded sampler cuts a ray into intervals, bounds the error of the opacity under a density that is
-constant on each interval, and adds cuts where they lower that bound most. No gradient flows through samples.
+The sampler cuts a ray into intervals, bounds the error of the opacity under a density that is constant on
+each interval, and adds cuts where they lower that bound most. No gradient flows through samples.
 
 The rendered samples are of two kinds (published code): most are distributed by opacity, and the rest, with
 both ends of the ray, is spread over the whole ray, so that the density is also sampled where it is low.
@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.settings.types import VolumeConfig
-from neilfpp_method.shading.sampling import strata
+from neilfpp_method.stratified.intervals import inverse_cdf_samples, uniform_samples
 from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
@@ -30,9 +30,7 @@ __all__ = [
     "ErrorBoundedSamples",
     "SampleCounts",
     "error_bounded_samples",
-    "inverse_cdf_samples",
     "sample_counts",
-    "uniform_samples",
 ]
 
 OPACITY_ERROR = 0.1
@@ -48,49 +46,6 @@ CUTS, ROUNDS = 128, 5
 """Cuts per ray in each round, and maximum number of refinement rounds (VolSDF Algorithm 1)."""
 SKIPPING_CUTS, SKIPPING_ROUNDS = 64, 2
 """The same if rays skip empty space: what is left of them is short."""
-
-
-# -------------------------------------------------------------------------------------------- simple samplers
-
-
-@torch.no_grad()
-def uniform_samples(
-    near: Float[Tensor, " N"], far: Float[Tensor, " N"], count: int, stochastic: bool
-) -> Float[Tensor, "N {count}"]:
-    """`count` ascending distances: near, far, and one in each equal part between, random or central."""
-    within = torch.lerp(near[:, None], far[:, None], strata(near[:, None], count - 2, stochastic))
-    return torch.cat([near[:, None], within, far[:, None]], dim=-1)
-
-
-@torch.no_grad()
-def inverse_cdf_samples(
-    edges: Float[Tensor, "N E"], mass: Float[Tensor, "N E-1"], count: int, stochastic: bool
-) -> Float[Tensor, "N {count}"]:
-    """Stratified samples of a piecewise constant distribution, in ascending order.
-
-    A bin without mass gets no sample. If all bins are without mass, samples are uniform from the first to the
-    last edge.
-
-    Args:
-        edges: bounds of the bins, ascending; a bin may have width 0.
-        mass: probability mass of each bin, ≥ 0, up to a common factor.
-        count: samples per ray, one in each of `count` equal shares of the mass.
-        stochastic: whether samples are random within their share; if False, they are at its centre.
-    """
-    tiny = torch.finfo(edges.dtype).tiny
-    mass = mass.to(edges.dtype)
-    total = mass.sum(dim=-1, keepdim=True)
-    # Without mass, use the widths, at least `tiny` against a division by zero for rays of length 0.
-    mass = torch.where(total > tiny, mass / total.clamp_min(tiny), edges.diff(dim=-1).clamp_min(tiny))
-    cdf = torch.nn.functional.pad(mass.cumsum(dim=-1), (1, 0))
-    cdf = cdf / cdf[:, -1:]
-    # With u below 1, the first edge whose CDF exceeds u closes a bin that has mass.
-    u = strata(edges, count, stochastic).clamp_max(1.0 - torch.finfo(edges.dtype).eps)
-    end = torch.searchsorted(cdf, u, right=True).clamp_max(mass.shape[-1])
-    low, high = cdf.gather(-1, end - 1), cdf.gather(-1, end)
-    # The clamps only matter if a parallel sum has rounded neighbouring values of the CDF out of order.
-    fraction = ((u - low) / (high - low).clamp_min(tiny)).clamp(0.0, 1.0)
-    return torch.lerp(edges.gather(-1, end - 1), edges.gather(-1, end), fraction)
 
 
 # -------------------------------------------------------------------------------------------- the error bound
