@@ -90,7 +90,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
         light_solver=model.light_solver(),
         watch=Watch(pixels.sample(64), listener.warn),
         plan=Plan.begin(EffectRequest("as-set"), config),
-        quality=Quality(hold_back(pixels, config.train.seed, patches), capture.hdr),
+        quality=Quality(hold_back(pixels, config.train.seed, patches)),
     )
 
 
