@@ -22,6 +22,7 @@ from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.empty_space import MAX_LIFE, RESOLUTION
+from neilfpp_method.volume.samplers import sample_counts
 
 __all__ = ["measurements", "queries_per_ray", "table_host"]
 
@@ -40,7 +41,9 @@ def table_host(skip_empty: bool = True) -> VolSdfHost:
     """The host of the scene, with the paper's sampler."""
     paper, small = preset("paper-ngp").volume, free_light(preset("fast"))
     volume = dataclasses.replace(paper, radius=small.volume.radius, skip_empty=skip_empty)
-    return fitted_model(dataclasses.replace(small, volume=volume)).host.train()
+    host = fitted_model(dataclasses.replace(small, volume=volume)).host.train()
+    host.sample_counts = sample_counts(paper)
+    return host
 
 
 def queries_per_ray(host: VolSdfHost, rays: RayBatch) -> float:
@@ -95,6 +98,5 @@ def with_cuts(host: VolSdfHost, cuts: int) -> VolSdfHost:
     uses half of the set number.
     """
     cuts = cuts if host.empty_space is None else 2 * cuts
-    volume = dataclasses.replace(host.config.volume, initial_samples=cuts)
-    host.config = dataclasses.replace(host.config, volume=volume)
+    host.sample_counts = dataclasses.replace(host.sample_counts, cuts=cuts)
     return host

@@ -31,11 +31,12 @@ from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
+    SampleCounts,
     bound_shares,
     bounded_beta,
     first_cuts,
@@ -134,19 +135,19 @@ class PlainHost(VolSdfHost):
         self.sdf_field = PlainSdf(self.sdf_field)
 
     @torch.no_grad()
-    def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
+    def _sample(self, rays: RayBatch, interval: Interval, counts: SampleCounts) -> Float[Tensor, "N M"]:
         beta = self.density.beta().reshape(1, 1)
-        partition = first_cuts(self.sdf, rays, interval, volume.initial_samples, self.training)
+        partition = first_cuts(self.sdf, rays, interval, counts.cuts, self.training)
         worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
         wide = torch.maximum(worst, beta)
-        for number in range(volume.rounds + 1):
+        for number in range(counts.rounds + 1):
             converged = log_error_bound(partition, beta) <= math.log(OPACITY_ERROR)
-            wide = torch.where(converged, beta, bounded_beta(partition, beta, wide, volume))
-            if number == volume.rounds or converged.all():
+            wide = torch.where(converged, beta, bounded_beta(partition, beta, wide))
+            if number == counts.rounds or converged.all():
                 break
             shares = bound_shares(partition, wide)
-            partition = with_cuts(self.sdf, rays, partition, shares, volume.initial_samples, self.training)
-        return opacity_samples(partition, wide, volume.samples, self.training)
+            partition = with_cuts(self.sdf, rays, partition, shares, counts.cuts, self.training)
+        return opacity_samples(partition, wide, counts.rendered, self.training)
 
 
 def straightforward(model: NeilfModel) -> NeilfModel:

@@ -85,9 +85,7 @@ def solve_under_truth(run: Run, known: Known, fits: int) -> None:
     model.light.log_radiance.fill_(math.log(model.facts.median_radiance / 0.3))
     model.lamps.count = 0
     light = LightModel(model.light, model.lamps)
-    objective = Objective(
-        model.facts.response, model.units.physical, settings.fit.steps, base_color_known=True
-    )
+    objective = Objective(model.facts.response, model.units.physical, base_color_known=True)
     for _ in range(fits):
         rows = torch.randperm(len(known.observed.position))[: settings.fit.points]
         points = FitPoints(known.observed[rows], known.material[rows], model.lobe, model.scene)

@@ -25,10 +25,8 @@ def tiny_config(**changes) -> NeilfConfig:
         radiance=dataclasses.replace(config.radiance, layers=1, width=16),
         brdf=dataclasses.replace(config.brdf, layers=1, width=16),
         light=dataclasses.replace(config.light, layers=4, width=16),
-        background=dataclasses.replace(config.background, layers=2, width=16, samples=4),
-        volume=dataclasses.replace(
-            config.volume, initial_samples=24, rounds=1, samples=20, beta_init=0.02, skip_empty=False
-        ),
+        background=dataclasses.replace(config.background, samples=4),
+        volume=dataclasses.replace(config.volume, samples=20, beta_init=0.02, skip_empty=False),
         shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
         inter_reflection=dataclasses.replace(config.inter_reflection, rays_per_point=0.5),
         loss=dataclasses.replace(config.loss, lambertian=5e-4),  # every loss of the table counts

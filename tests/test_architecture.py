@@ -19,7 +19,7 @@ SOURCES = {
 # A package may import packages to its left and itself; packages of one layer do not import each other. Lower
 # is right.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "structures", "timing"),
+    ("errors", "stratified", "structures", "timing"),
     ("settings",),
     ("kernels",),
     ("shading", "schedule"),
@@ -170,8 +170,9 @@ def test_modules_are_short(source):
         ("shading.brdf", "fields.brdf", True),
         ("fields.brdf", "shading.brdf", False),
         ("shading.brdf", "shading.frame", False),
-        ("volume.samplers", "shading.sampling", False),
         ("shading.sampling", "volume.density", True),
+        ("shading.sampling", "stratified.intervals", False),
+        ("volume.samplers", "stratified.intervals", False),
         ("hosts.base", "schedule", False),
         ("hosts.base", "hosts.volsdf", True),
         ("fields.sdf", "data.mesh", True),

@@ -50,7 +50,7 @@ def small_settings(**steps: int) -> NeilfConfig:
     unless `steps` changes it.
     """
     config, usual = small_config(**steps), preset("fast")
-    fit = LightFitConfig(points=48, every=3, steps=5)
+    fit = LightFitConfig(points=48, every=3)
     return dataclasses.replace(
         config,
         volume=dataclasses.replace(config.volume, beta_final=usual.volume.beta_final),

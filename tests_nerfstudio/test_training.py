@@ -20,6 +20,7 @@ from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.plugin.outputs import mean_incident_light
 from neilfpp_method.schedule import STAGES, Stage, stage_steps
 from neilfpp_method.settings.presets import fixed_geometry, free_light
 from neilfpp_method.settings.types import NeilfConfig
@@ -256,6 +257,6 @@ def test_light_on_a_wall_is_its_irradiance_over_pi(run: Path, monkeypatch) -> No
     up = torch.tensor([[0.0, 0.0, 1.0]])
     one, three = torch.ones(1, 1), torch.ones(1, 3)
     maps = Maps(three, three, three, three, three, one, one, up, one, one)
-    light = model._incident_light(RayBatch(2.0 * up, -up), maps)
+    light = mean_incident_light(model.neilf, RayBatch(2.0 * up, -up), maps)
     # ∫ cos θ · cos θ dω over the hemisphere is 2π/3; a lattice of 8 directions is close to it.
     torch.testing.assert_close(light, torch.full((1, 3), 2.0 / 3.0), atol=0.05, rtol=0)

@@ -146,7 +146,7 @@ MUTANTS: Sequence[Mutant] = (
     ),
     Mutant(
         "stratified samples are always midpoints",
-        SAMPLING,
+        "stratified/intervals.py",
         "(k + (torch.rand_like(k) if stochastic else 0.5)) / count",
         "(k + 0.5) / count",
         "shading/test_sampling.py",

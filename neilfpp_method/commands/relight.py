@@ -80,7 +80,8 @@ class Relight:
 
 def run(options: Relight) -> None:
     from neilfpp_method.kernels.process import computing_fast
-    from neilfpp_method.relight.command import RelightRequest, relight
+    from neilfpp_method.relight.command import relight
+    from neilfpp_method.relight.request import RelightRequest
 
     console = terminal()
     messages: list[str] = []

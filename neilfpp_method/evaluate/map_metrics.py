@@ -13,7 +13,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.confidence import material_deviation, measure_residuals, surface_at_pixels
 from neilfpp_method.evaluate.views import KnownView, RenderedView, mean_observed_color, surface_points
-from neilfpp_method.shading.color import CLIPPED, srgb_to_linear, tone_map
+from neilfpp_method.shading.color import CLIPPED, display_values, srgb_to_linear, tone_map
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
@@ -50,7 +50,7 @@ def image_metrics(run: Run, pairs: Pairs) -> dict[str, float]:
     rendered = {"volume": "rgb_volume"} | ({"pbr": "rgb"} if run.has_material else {})
     scores = Scores()
     for view, known in pairs:
-        image = _tone_mapped(known.image) if run.capture.hdr else known.image
+        image = display_values(torch.from_numpy(known.image), run.facts.response).numpy()
         for name, key in rendered.items():
             estimate = _tone_mapped(view.maps[key])
             scores[f"{name}_psnr"].append(metrics.psnr(estimate, image, known.mask))

@@ -16,7 +16,7 @@ from torch import Tensor
 from neilfpp_method.data.memory import check_memory
 from neilfpp_method.data.ply import NORMAL, write_ply
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.base import HasSdf
+from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.shading.color import tone_map
@@ -29,6 +29,7 @@ __all__ = [
     "extract_mesh",
     "has_surface",
     "materials_in_parts",
+    "shading_normals",
     "surface_mesh",
 ]
 
@@ -47,6 +48,8 @@ BYTES_PER_POINT = 8
 """Memory of a grid point in bytes: its distance in the order of the blocks, and in the order of the grid."""
 POINTS_AT_ONCE = 65_536
 """Number of points per evaluation of the material, which bounds the memory."""
+NORMALS_AT_ONCE = 2**14
+"""Number of points per call of the host's normal smoothing, which reads 32 neighbours of each."""
 
 
 @torch.no_grad()
@@ -133,7 +136,7 @@ def surface_mesh(run: Run, resolution: int = 256) -> trimesh.Trimesh:
     if not isinstance(host, HasSdf):
         raise UserError(
             f"{run.path}: the host of this run has no distance field and no mesh",
-            "export from a run of another host",
+            "use a run of the VolSDF or mesh host",
         )
     # Stay inside the sphere that may close the scene, which is no surface of the object.
     return extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=run.device)
@@ -168,6 +171,18 @@ def materials_in_parts(run: Run, position: Float[Tensor, "N 3"]) -> Material:
     """Evaluate the material at any number of points of the scene frame, in batches."""
     parts = [run.model.materials(part) for part in position.split(POINTS_AT_ONCE)]
     return Material.joined(parts)
+
+
+@torch.no_grad()
+def shading_normals(
+    run: Run, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """The normals with which a run shades points of its surface: smoothed if the host smooths them."""
+    host = run.model.host
+    if not isinstance(host, SmoothsNormals):
+        return normal
+    parts = zip(position.split(NORMALS_AT_ONCE), normal.split(NORMALS_AT_ONCE), strict=True)
+    return torch.cat([host.smooth_normals(places, normals) for places, normals in parts])
 
 
 def _sparse_grid(

@@ -22,6 +22,10 @@ __all__ = ["InvertedSphere"]
 
 POSITION_OCTAVES, DIRECTION_OCTAVES = 10, 4
 """Octaves of the frequency encodings of positions and directions (NeRF++)."""
+FREQUENCY_LAYERS, FREQUENCY_WIDTH = 8, 256
+"""Hidden layers and their units with frequency encodings (NeRF++)."""
+HASH_LAYERS, HASH_WIDTH = 2, 64
+"""The same with a hash grid (published code): the grid represents detail, so a small network is enough."""
 SHELL_RADIUS = 2.0
 """Outer radius of the shell into which the space beyond the sphere is contracted; the inner one is 1."""
 MIN_START = 1e-2
@@ -56,16 +60,14 @@ class InvertedSphere(nn.Module):
         self.radius = radius
         self.scale = scale
         self.samples = config.samples
-        self.position = (
-            FrequencyEncoding(POSITION_OCTAVES, dimensions=4)
-            if isinstance(encoding, FrequencyConfig)
-            else position_encoding(encoding, SHELL_RADIUS)
-        )
+        if isinstance(encoding, FrequencyConfig):
+            self.position = FrequencyEncoding(POSITION_OCTAVES, dimensions=4)
+            layers, width = FREQUENCY_LAYERS, FREQUENCY_WIDTH
+        else:
+            self.position = position_encoding(encoding, SHELL_RADIUS)
+            layers, width = HASH_LAYERS, HASH_WIDTH
         self.direction = FrequencyEncoding(DIRECTION_OCTAVES)
-        width = config.width
-        self.trunk = Mlp(
-            self.position.width, 1 + width, config.layers, width, "relu", skip=config.layers // 2
-        )
+        self.trunk = Mlp(self.position.width, 1 + width, layers, width, "relu", skip=layers // 2)
         self.head = Mlp(width + self.direction.width, 3, 1, width // 2, "relu", output_scale=START_SCALE)
         if start is not None:
             with torch.no_grad():

@@ -23,7 +23,8 @@ from neilfpp_method.fields.direction_map import (
     texels_of,
 )
 from neilfpp_method.shading.frame import at_least_float32
-from neilfpp_method.shading.sampling import Technique, strata
+from neilfpp_method.shading.sampling import Technique
+from neilfpp_method.stratified.intervals import strata
 
 __all__ = ["radiance_times_cosine"]
 

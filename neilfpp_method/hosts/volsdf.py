@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -15,7 +15,7 @@ from neilfpp_method.hosts.base import RegularizedHits
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.facts import SceneFacts
-from neilfpp_method.settings.types import NeilfConfig, VolumeConfig
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.timing.ledger import timed
@@ -25,7 +25,7 @@ from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, samp
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from neilfpp_method.volume.intersect import Interval, sphere_interval
-from neilfpp_method.volume.samplers import error_bounded_samples
+from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples, sample_counts
 
 __all__ = ["VolSdfHost"]
 
@@ -112,6 +112,7 @@ class VolSdfHost(nn.Module):
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
+        self.sample_counts = sample_counts(config.volume)
         hard = config.inter_reflection.mode == "hard"
         resolution = GRID_RESOLUTION if hard else 0
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
@@ -280,15 +281,14 @@ class VolSdfHost(nn.Module):
     def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
         """Sample and blend rays; `part` is the part of each ray to sample, if it is known."""
         interval = part or sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
-        volume, narrowed = self.config.volume, part is not None
+        narrowed = part is not None
         if self.empty_space is not None and self.training:
             narrow = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
             # Without a background the scene sphere has the radiance R: rays are sampled up to it.
             interval = Interval(narrow.near, interval.far) if self.background_kind == "none" else narrow
             narrowed = True
-        if narrowed:
-            volume = replace(volume, initial_samples=max(volume.initial_samples // 2, 1))
-        distances = self._sample(rays, interval, volume)
+        counts = self.sample_counts.of_narrowed_rays() if narrowed else self.sample_counts
+        distances = self._sample(rays, interval, counts)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
         if surface.distance.requires_grad:
@@ -301,9 +301,9 @@ class VolSdfHost(nn.Module):
         hits = self._blend(rays, distances, weights, normals.view_as(points), radiance.view_as(points))
         return March(distances, surface, hits)
 
-    def _sample(self, rays: RayBatch, interval: Interval, volume: VolumeConfig) -> Float[Tensor, "N M"]:
+    def _sample(self, rays: RayBatch, interval: Interval, counts: SampleCounts) -> Float[Tensor, "N M"]:
         beta = self.density.beta().detach()
-        return error_bounded_samples(self.sdf, rays, interval, beta, volume, self.training).distances
+        return error_bounded_samples(self.sdf, rays, interval, beta, counts, self.training).distances
 
     def _blend(
         self,

@@ -64,6 +64,8 @@ LINEAR_SHARE = 0.02
 """Share of all light below which the sparsity prior of a lamp is about linear; above, it is logarithmic."""
 NEIGHBORS = 4
 """Number of neighbouring points with which the base colour of a point is compared."""
+STEPS = 100
+"""Optimisation steps of a fit. Each fit starts from the result of the last one, so few are enough."""
 DARK_FLOOR = 0.02
 """Base colours are raised to at least this value before their logarithms are compared."""
 
@@ -104,7 +106,7 @@ class Objective:
 
     response: str
     unit: float
-    steps: int
+    steps: int = STEPS
     base_color_known: bool = False
     sky: KnownSky | None = None
     monochrome: bool = False

@@ -240,7 +240,6 @@ class MapSolver(nn.Module):
         objective = Objective(
             self.response,
             self.unit,
-            self.config.fit.steps,
             sky=sky,
             monochrome=self.config.monochrome,
             # If cameras saw the light directly, their pixels fix the scale.

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any, Optional
 
 import torch
-from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import OptimizerConfig, Optimizers
@@ -34,15 +33,14 @@ from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, to_pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
+from neilfpp_method.plugin.outputs import method_outputs
 from neilfpp_method.plugin.pictures import view_figures, view_pictures
 from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.shading.color import apply_response
-from neilfpp_method.shading.sampling import combine, cosine
-from neilfpp_method.structures import Maps, RayBatch, StepResult
+from neilfpp_method.structures import RayBatch, StepResult
 from neilfpp_method.train.build import build_model, scene_facts, show_known_light
 from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.optimizer import (
@@ -336,38 +334,10 @@ class NeilfMethod(Model):
         if self.training:
             return {"origins": rays.origins, "directions": rays.directions}
         # Before material is trained, its initial values are not shown.
-        maps = self.neilf.maps(rays, with_material=self._has_material())
-        response = self.neilf.facts.response
-        return {
-            "rgb": apply_response(maps.rgb, response),
-            "rgb_volume": apply_response(maps.rgb_volume, response),
-            "base_color": maps.base_color,
-            "roughness": maps.roughness,
-            "metallic": maps.metallic,
-            "incident_light": self._incident_light(rays, maps),
-            "normal": maps.normal,
-            "depth": maps.depth,
-            "accumulation": maps.opacity,
-        }
+        return method_outputs(self.neilf, rays, with_material=self._has_material())
 
     def _has_material(self) -> bool:
         return has_material(self.step + 1, self.config.neilf.train)
-
-    @torch.no_grad()
-    def _incident_light(self, rays: RayBatch, maps: Maps) -> Float[Tensor, "N 3"]:
-        """Irradiance divided by π at the hits: the cosine-weighted mean of the incident radiance."""
-        light = torch.zeros_like(maps.rgb)
-        # Roughness is 0 for rays without a hit, and for all rays before material is trained.
-        rows = torch.nonzero(maps.roughness[:, 0])[:, 0]
-        if not len(rows):
-            return light
-        normal = maps.normal[rows]
-        position = rays.origins[rows] + maps.depth[rows] * rays.directions[rows]
-        count = self.config.neilf.shading.train_samples
-        # The pdf of the cosine sampler cancels the cosine, so the estimate is a plain mean.
-        drawn = combine([(cosine(normal), count)], stochastic=False)
-        light[rows] = self.neilf.incident_light(position, drawn.wi).mean(dim=1)
-        return light
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neilfpp_method.evaluate.metrics import psnr, ssim
 from neilfpp_method.plugin.datamanager import VALID
-from neilfpp_method.shading.color import tone_map
+from neilfpp_method.shading.color import display_values, tone_map
 
 __all__ = ["view_figures", "view_pictures"]
 
@@ -30,10 +30,10 @@ def view_figures(
     Returns:
         `psnr` and `ssim` of the PBR image, `volume_psnr` and `volume_ssim` of the volume-rendered image.
     """
-    image, mask = _shown(batch["image"], response).cpu().numpy(), _counted(outputs, batch)
+    image, mask = display_values(batch["image"], response).cpu().numpy(), _counted(outputs, batch)
     figures = {}
     for prefix, name in (("", "rgb"), ("volume_", "rgb_volume")):
-        rendered = _shown(outputs[name], response).cpu().numpy()
+        rendered = display_values(outputs[name], response).cpu().numpy()
         figures[f"{prefix}psnr"] = psnr(rendered, image, mask)
         figures[f"{prefix}ssim"] = ssim(rendered, image, mask)
     return figures
@@ -51,9 +51,10 @@ def view_pictures(
         with_material: whether material has been trained; if not, its maps are left out.
     """
     accumulation = outputs["accumulation"]
+    sides = [display_values(image, response) for image in (batch["image"], outputs["rgb"])]
     pictures = {
-        "img": torch.cat([_shown(batch["image"], response), _shown(outputs["rgb"], response)], dim=1),
-        "rgb_volume": _shown(outputs["rgb_volume"], response),
+        "img": torch.cat(sides, dim=1),
+        "rgb_volume": display_values(outputs["rgb_volume"], response),
         "normal": 0.5 * (outputs["normal"] + 1.0) * accumulation,
         "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation),
         "accumulation": accumulation.expand(-1, -1, 3),
@@ -68,8 +69,3 @@ def _counted(outputs: Mapping[str, Tensor], batch: Mapping[str, Tensor]) -> Bool
     """Valid pixels on the object; without a mask, those on which the rendering shows it."""
     on_object = batch["object_mask"] if batch["mask_known"].any() else outputs["accumulation"]
     return ((on_object > 0.5) & batch[VALID])[..., 0].cpu().numpy()
-
-
-def _shown(color: Float[Tensor, "H W 3"], response: str) -> Float[Tensor, "H W 3"]:
-    """Display values of colours in a response."""
-    return tone_map(color) if response == "linear" else color.clamp(0.0, 1.0)

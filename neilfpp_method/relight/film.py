@@ -13,7 +13,7 @@ from torch import Tensor
 from neilfpp_method.data.views import Camera
 from neilfpp_method.relight.cameras import pixel_rays
 from neilfpp_method.relight.path_tracer import DIMENSIONS, Scene, trace_paths
-from neilfpp_method.relight.sequence import Numbers, Sequence
+from neilfpp_method.relight.sequence import Numbers, SobolSequence
 
 __all__ = ["Budget", "Picture", "render_picture"]
 
@@ -84,7 +84,7 @@ def render_picture(
     device = scene.sky.radiance.device
     pixels, begun = camera.width * camera.height, monotonic()
     max_samples = budget.samples or MAX_SAMPLES
-    sequence = Sequence(PIXEL_DIMENSIONS + bounces * DIMENSIONS, seed)
+    sequence = SobolSequence(PIXEL_DIMENSIONS + bounces * DIMENSIONS, seed)
     sums = torch.zeros(pixels, 10, dtype=torch.float64, device=device)
     done = 0
     while done < max_samples:

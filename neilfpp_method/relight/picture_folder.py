@@ -22,8 +22,8 @@ from neilfpp_method.train.json_files import read_json
 
 __all__ = ["PictureFolder", "StoredPicture"]
 
-OTHER = {"map_sha256": "another map of this name", "weights_sha256": "the weights of another training"}
-"""What differs if a setting does whose values tell the user nothing."""
+IN_WORDS = {"map_sha256": "another map of this name", "weights_sha256": "the weights of another training"}
+"""What a message says in place of the values of a setting that differs: hashes tell the user nothing."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class PictureFolder:
         stored = read_json(record)
         for key, value in self._record(shot).items():
             if stored.get(key) != value:
-                other = OTHER.get(key, f"{key} {stored.get(key)}, not {value}")
+                other = IN_WORDS.get(key, f"{key} {stored.get(key)}, not {value}")
                 problem = f"{record}: the image was rendered with {other}"
                 raise UserError(problem, "choose another --out, or render again with --force")
         return all(self._file(shot, suffix).is_file() for suffix in (".exr", ".png"))

@@ -4,21 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.mesh import extract_mesh
-from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
+from neilfpp_method.export.mesh import shading_normals, surface_mesh
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.train.run import Run
 
 __all__ = ["check_material", "surface_of_run"]
-
-NORMALS_AT_ONCE = 2**14
-"""Number of points per call of the host's normal smoothing, which bounds the memory."""
 
 
 def check_material(run: Run) -> None:
@@ -47,28 +40,12 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
     host, device = run.model.host, run.device
     if isinstance(host, MeshHost):
         triangles, normals = host.triangles.float(), host.corner_normals.float()
-        if isinstance(host, SmoothsNormals) and run.config.volume.normal_radius > 0:
-            smooth = _smoothed(host, triangles.reshape(-1, 3), normals.reshape(-1, 3))
-            normals = smooth.view_as(triangles)
-        return Surface(triangles, normals)
-    if not isinstance(host, HasSdf):
-        raise UserError(
-            f"{run.path}: the host of this run has no surface to trace",
-            "use a run of the VolSDF or mesh host",
-        )
-    mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=device)
+        smooth = shading_normals(run, triangles.reshape(-1, 3), normals.reshape(-1, 3))
+        return Surface(triangles, smooth.view_as(triangles))
+    mesh = surface_mesh(run, resolution)
     vertices, normals = (
         torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device)
         for part in (mesh.vertices, mesh.vertex_normals)
     )
-    if isinstance(host, SmoothsNormals):
-        normals = _smoothed(host, vertices, normals)
     faces = torch.from_numpy(np.asarray(mesh.faces, dtype=np.int64)).to(device)
-    return Surface(vertices[faces], normals[faces])
-
-
-def _smoothed(
-    host: SmoothsNormals, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N 3"]:
-    pairs = zip(position.split(NORMALS_AT_ONCE), normal.split(NORMALS_AT_ONCE), strict=True)
-    return torch.cat([host.smooth_normals(x, n) for x, n in pairs])
+    return Surface(vertices[faces], shading_normals(run, vertices, normals)[faces])

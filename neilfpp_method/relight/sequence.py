@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-__all__ = ["Numbers", "Sequence"]
+__all__ = ["Numbers", "SobolSequence"]
 
 WORD = 0xFFFFFFFF
 """Mask of 32 bits. The product of a word and a multiplier below 2³¹ fits into int64."""
@@ -49,7 +49,7 @@ class Numbers:
         return (shifted - shifted.floor()).clamp_max(1 - 2**-24)
 
 
-class Sequence:
+class SobolSequence:
     """The sequence of one image, generated in blocks of samples.
 
     Args:

@@ -13,7 +13,7 @@ __all__ = ["check_config"]
 COUNTS = {
     "train": ("rays", "checkpoint_every"),
     "shading": ("train_samples", "eval_samples"),
-    "volume": ("initial_samples", "samples"),
+    "volume": ("samples",),
 }
 """Settings that are at least 1, by group."""
 SHARES = {"shading": ("hit_share",), "brdf": ("initial_base_color", "initial_metallic")}

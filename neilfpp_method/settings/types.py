@@ -112,8 +112,6 @@ class LightFitConfig:
     """Surface points that the light is fitted to. Memory and time grow with points times texels."""
     every: int = 100
     """Training steps between two fits."""
-    steps: int = 100
-    """Optimization steps of a fit."""
 
 
 @dataclass(frozen=True)
@@ -171,10 +169,6 @@ class BackgroundConfig:
     """Linear RGB of a constant background, and initial colour of inverted_sphere. If not given, it is taken
     from the image borders.
     """
-    layers: int = 8
-    """Number of hidden layers of the NeRF++ field."""
-    width: int = 256
-    """Units per hidden layer of the NeRF++ field."""
     samples: int = 32
     """Samples per ray beyond the scene sphere."""
 
@@ -217,13 +211,9 @@ class VolumeConfig:
     beta_final: float = 0.0
     """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound."""
     skip_empty: bool = False
-    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation."""
-    initial_samples: int = 128
-    """SDF queries per ray in the first round of the sampler and in each refinement round. Rays that skip
-    empty space use half as many, as the rest of them is short.
+    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation.
+    The sampler then queries the SDF less often, as the rest of a ray is short.
     """
-    rounds: int = 5
-    """Maximum number of refinement rounds of the sampler."""
     samples: int = 98
     """Rendered samples per ray: two thirds by opacity, the rest spread over the whole ray with both ends."""
     normal_radius: float = 0.0

@@ -12,6 +12,7 @@ __all__ = [
     "CLIPPED",
     "apply_response",
     "at_common_exposure",
+    "display_values",
     "linear_to_srgb",
     "luminance",
     "residual",
@@ -58,6 +59,11 @@ def apply_response(color: Float[Tensor, "*shape"], response: str) -> Float[Tenso
     if response == "srgb":
         return tone_map(color)
     raise UserError(f"unknown response '{response}'", "choose linear or srgb")
+
+
+def display_values(pixel: Float[Tensor, "*shape"], response: str) -> Float[Tensor, "*shape"]:
+    """Display values of pixels in a response: linear pixels are tone-mapped, display values only clipped."""
+    return tone_map(pixel) if response == "linear" else pixel.clamp(0, 1)
 
 
 def residual(

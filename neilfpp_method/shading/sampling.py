@@ -24,6 +24,7 @@ from torch import Tensor
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.brdf import Lobe, cosines
 from neilfpp_method.shading.frame import at_least_float32, dot, local_frame
+from neilfpp_method.stratified.intervals import strata
 from neilfpp_method.structures import IncidentSamples
 
 __all__ = [
@@ -38,7 +39,6 @@ __all__ = [
     "sample_directions",
     "specular_lobe",
     "sphere_lattice",
-    "strata",
 ]
 
 GOLDEN_TURN = (3 - math.sqrt(5)) / 2
@@ -78,22 +78,6 @@ def _lattice(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> _Lattice:
     k = torch.arange(count, device=n.device, dtype=n.dtype).expand(len(n), count)
     shift = torch.rand_like(n[:, :1]) if stochastic else 0.0
     return _Lattice(strata(n, count, stochastic), (k * GOLDEN_TURN + shift).frac())
-
-
-def strata(like: Float[Tensor, "N _"], count: int, stochastic: bool) -> Float[Tensor, "N S"]:
-    """Ascending numbers in [0, 1], one in each of `count` equal strata, for each row of a tensor.
-
-    Args:
-        like: a tensor with N rows; the result has its device and type.
-        count: the number S of strata.
-        stochastic: whether a number is random in its stratum; otherwise it is the midpoint.
-
-    Example:
-        >>> strata(torch.zeros(1, 3), 4, stochastic=False)
-        tensor([[0.1250, 0.3750, 0.6250, 0.8750]])
-    """
-    k = torch.arange(count, device=like.device, dtype=like.dtype).expand(len(like), count)
-    return (k + (torch.rand_like(k) if stochastic else 0.5)) / count
 
 
 def _about(

@@ -261,7 +261,7 @@ def _train(
             light_solver=prepared.model.light_solver(),
             watch=_watch(pixels, config, reporter),
             plan=run.plan,
-            quality=Quality(held_back, run.capture.hdr),
+            quality=Quality(held_back),
             ledger=ledger,
             pace=None if run.budget is None else Pace(run.budget, ledger),
         )

@@ -15,7 +15,7 @@ from neilfpp_method.data.view_pixels import read_colors
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.schedule import Stage
-from neilfpp_method.shading.color import tone_map
+from neilfpp_method.shading.color import display_values, tone_map
 from neilfpp_method.structures import RayBatch
 
 __all__ = ["preview_pixels", "write_preview"]
@@ -41,7 +41,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     """
     view = _small_view(capture)
     shape = (view.camera.height, view.camera.width, 3)
-    panels = [_photograph(view, capture.hdr)]
+    panels = [_photograph(view, capture.hdr, model.facts.response)]
     rays = camera_rays(capture.scene_camera(view))
     panels += [p.reshape(shape) for p in _panels(model, rays, model.stages[stage].moves_material)]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
@@ -61,9 +61,8 @@ def _small_view(capture: Capture) -> View:
     return scaled_view(view, min(1.0, MAX_SIDE / max(file_size(view))))
 
 
-def _photograph(view: View, hdr: bool) -> np.ndarray:
-    pixels = torch.from_numpy(read_colors(view, hdr))
-    return (tone_map(pixels) if hdr else pixels).numpy()
+def _photograph(view: View, hdr: bool, response: str) -> np.ndarray:
+    return display_values(torch.from_numpy(read_colors(view, hdr)), response).numpy()
 
 
 def _panels(model: NeilfModel, rays: RayBatch, with_material: bool) -> list[np.ndarray]:

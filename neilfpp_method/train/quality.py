@@ -24,7 +24,7 @@ from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePosition
-from neilfpp_method.shading.color import tone_map
+from neilfpp_method.shading.color import display_values, tone_map
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.json_files import is_finite_number, read_entries
 
@@ -67,12 +67,10 @@ class Quality:
 
     Attributes:
         pixels: the held-back pixels; if the capture is too small to hold any back, nothing is measured.
-        hdr: whether the pixels are linear radiance rather than display values.
         checks: the measurements in order.
     """
 
     pixels: PixelBatch
-    hdr: bool
     checks: list[QualityCheck] = field(default_factory=list)
 
     def check_when_due(self, model: NeilfModel, position: StagePosition, step: int, seconds: float) -> None:
@@ -87,7 +85,7 @@ class Quality:
         if not len(self.pixels) or not self._due(position, step, seconds):
             return
         began = time.perf_counter()
-        psnr = _measure(model, self.pixels, model.stages[position.stage].moves_material, self.hdr)
+        psnr = _measure(model, self.pixels, model.stages[position.stage].moves_material)
         took = time.perf_counter() - began
         # A model that is not finite is reported by `health`.
         if math.isfinite(psnr.radiance) and math.isfinite(psnr.physical or 0.0):
@@ -112,10 +110,10 @@ class _Measured:
 
 
 @torch.no_grad()
-def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool, hdr: bool) -> _Measured:
+def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> _Measured:
     with model.evaluating():
         maps = model.maps(pixels.rays, with_material)
-    photograph = tone_map(pixels.color) if hdr else pixels.color
+    photograph = display_values(pixels.color, model.facts.response)
     physical = _psnr(tone_map(maps.rgb), photograph) if with_material else None
     return _Measured(_psnr(tone_map(maps.rgb_volume), photograph), physical)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from neilfpp_method.evaluate.pictures import auto_exposure, display_color, lat_long_directions
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths
-from neilfpp_method.relight.sequence import Sequence
+from neilfpp_method.relight.sequence import SobolSequence
 from neilfpp_method.relight.surface import OFFSET
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
@@ -74,7 +74,7 @@ def _by_paths(
     scene = scene_of(subject, light)
     origins = (point.position + OFFSET * point.normal).expand_as(directions).contiguous()
     rows = torch.arange(len(directions), device=subject.device)
-    numbers, total = Sequence(BOUNCES * DIMENSIONS, seed=0), torch.zeros_like(directions)
+    numbers, total = SobolSequence(BOUNCES * DIMENSIONS, seed=0), torch.zeros_like(directions)
     for _ in range(SAMPLES):
         sample = numbers.next(1, len(rows), subject.device)
         total += trace_paths(scene, RayBatch(origins, directions), sample, BOUNCES).radiance

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.evaluate.pictures import display, display_color
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.relight.cameras import pixel_rays, resized
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths
-from neilfpp_method.relight.sequence import Sequence
+from neilfpp_method.relight.sequence import SobolSequence
+from neilfpp_method.relight.surface import Intersections
 from neilfpp_method.structures import RayBatch
-from neilfpp_method.view.pace import RenderSpeed, sizes
+from neilfpp_method.view.speed import RenderSpeed, sizes
 from neilfpp_method.view.subject import Lighting, Subject, scene_of
 
 __all__ = ["PictureRequest", "ViewerFrame", "frames"]
@@ -76,26 +78,28 @@ Shader = Callable[[RayBatch, Tensor], Tensor]
 """Maps rays and their pixel indices to RGB and opacity, (N, 4)."""
 
 
-def frames(request: PictureRequest, pace: RenderSpeed) -> Iterator[ViewerFrame | None]:
+def frames(request: PictureRequest, speed: RenderSpeed) -> Iterator[ViewerFrame | None]:
     """Yield successively finer images of a request, and None between batches, when rendering may stop.
 
     Args:
         request: the view to render.
-        pace: rendering speed of this machine, to which measurements are added.
+        speed: rendering speed of this machine, to which measurements are added.
     """
     traced = request.layer == "pbr" and request.light.sky is not None
-    for share in sizes(request.camera.width, request.camera.height, pace.first_image(request.layer)):
+    for share in sizes(request.camera.width, request.camera.height, speed.first_image(request.layer)):
         camera = resized(request.camera, share)
-        total = None
+        total, depth = None, None
         for sample in range(SAMPLES if traced and share == 1 else 1):
             shader = _path_shader(request, camera, sample) if traced else _layer_shader(request)
-            values = yield from _render(request, camera, shader, pace, jitter=sample if traced else 0)
+            values = yield from _render(request, camera, shader, speed, jitter=sample if traced else 0)
             total = values if total is None else total + values
-            yield _frame(request, camera, total / (sample + 1), share, sample + 1)
+            depth = _depth(request.subject, camera) if depth is None else depth
+            image = _image(request, total / (sample + 1), depth.shape)
+            yield ViewerFrame(image, depth, share, samples=sample + 1)
 
 
 def _render(
-    request: PictureRequest, camera: Camera, shader: Shader, pace: RenderSpeed, jitter: int
+    request: PictureRequest, camera: Camera, shader: Shader, speed: RenderSpeed, jitter: int
 ) -> Generator[None, None, Float[Tensor, "P 4"]]:
     """Yield None after each batch but the last, and return RGB and opacity of all pixels.
 
@@ -109,13 +113,13 @@ def _render(
         position = torch.full((2,), 0.5, device=device)
     done, start = [], 0
     while start < len(pixels):
-        rows = pixels[start : start + pace.batch(layer)]
+        rows = pixels[start : start + speed.batch(layer)]
         begun = time.perf_counter()
         rays = pixel_rays(camera, rows, position).rays
         # The copy to the CPU waits for the device, so that the measured time is that of the work.
         with torch.no_grad():
             done.append(shader(rays, rows).cpu())
-        pace.note(layer, len(rows), time.perf_counter() - begun)
+        speed.note(layer, len(rows), time.perf_counter() - begun)
         start += len(rows)
         if start < len(pixels):
             yield None
@@ -125,7 +129,7 @@ def _render(
 def _path_shader(request: PictureRequest, camera: Camera, sample: int) -> Shader:
     """A shader that traces one path per pixel."""
     scene, pixels = scene_of(request.subject, request.light), camera.width * camera.height
-    numbers = Sequence(BOUNCES * DIMENSIONS, SEED + sample).next(1, pixels, request.subject.device)
+    numbers = SobolSequence(BOUNCES * DIMENSIONS, SEED + sample).next(1, pixels, request.subject.device)
 
     def shade(rays: RayBatch, rows: Tensor) -> Tensor:
         traced = trace_paths(scene, rays, numbers.of(rows), BOUNCES)
@@ -148,32 +152,33 @@ def _layer_shader(request: PictureRequest) -> Shader:
         hits = subject.surface.intersect(rays.origins, rays.directions)
         hits = hits[torch.nonzero(hits.outside)[:, 0]]
         result = rays.origins.new_zeros(len(rays), 4)
-        if not len(hits.rows):
-            return result
-        if layer == "normal":
-            value = hits.normal
-        else:
-            material = model.materials(hits.position)
-            if layer == "pbr":
-                wo, samples = -rays.directions[hits.rows], model.config.shading.eval_samples
-                value = model.shade(hits.position, hits.normal, wo, material, samples).color
-            else:
-                value = getattr(material, layer).expand(-1, 3)
-        result[hits.rows] = _opaque(value)
+        if len(hits.rows):
+            result[hits.rows] = _opaque(_layer_at(model, layer, hits, -rays.directions[hits.rows]))
         return result
 
     return shade
+
+
+def _layer_at(
+    model: NeilfModel, layer: str, hits: Intersections, wo: Float[Tensor, "K 3"]
+) -> Float[Tensor, "K 3"]:
+    """Values of a layer at hits of the surface that are seen from the directions wo."""
+    if layer == "normal":
+        return hits.normal
+    material = model.materials(hits.position)
+    if layer == "pbr":
+        return model.shade(hits.position, hits.normal, wo, material, model.config.shading.eval_samples).color
+    return getattr(material, layer).expand(-1, 3)
 
 
 def _opaque(color: Float[Tensor, "N 3"]) -> Float[Tensor, "N 4"]:
     return torch.cat((color, torch.ones_like(color[:, :1])), -1)
 
 
-def _frame(
-    request: PictureRequest, camera: Camera, values: Float[Tensor, "P 4"], share: float, samples: int
-) -> ViewerFrame:
+def _image(
+    request: PictureRequest, values: Float[Tensor, "P 4"], shape: tuple[int, ...]
+) -> UInt8[np.ndarray, "H W 3"]:
     """Convert RGB and opacity to an 8-bit image over the background."""
-    shape = (camera.height, camera.width)
     alpha = values[:, 3:].clamp(0, 1)
     straight = (values[:, :3] / alpha.clamp_min(1e-6)).view(*shape, 3).numpy()
     if request.layer in ("pbr", "radiance"):
@@ -183,8 +188,7 @@ def _frame(
     else:
         image = display(request.layer, straight)
     opacity = alpha.view(*shape, 1).numpy()
-    image = np.rint(opacity * image + (1 - opacity) * 255 * PAPER).astype(np.uint8)
-    return ViewerFrame(image, _depth(request.subject, camera), share, samples)
+    return np.rint(opacity * image + (1 - opacity) * 255 * PAPER).astype(np.uint8)
 
 
 def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:

@@ -26,9 +26,9 @@ from neilfpp_method.relight.sky import Sky
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.view.cameras import Pose, pinhole, pose_of
 from neilfpp_method.view.incident_map import SurfacePoint, light_at, light_picture, point_under
-from neilfpp_method.view.pace import RenderSpeed
 from neilfpp_method.view.painter import Painter
 from neilfpp_method.view.pictures import PictureRequest, ViewerFrame, frames
+from neilfpp_method.view.speed import RenderSpeed
 from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
@@ -58,12 +58,12 @@ class Shared:
 
     Attributes:
         skies: environment maps by name.
-        pace: measured rendering speed.
+        speed: measured rendering speed.
         lock: held while the model is used.
     """
 
     skies: Mapping[str, Sky]
-    pace: RenderSpeed = field(default_factory=RenderSpeed)
+    speed: RenderSpeed = field(default_factory=RenderSpeed)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
 
@@ -75,6 +75,13 @@ class Session:
         subject: the run.
         client: the browser.
         previous: the closed session of the same browser, whose layer and camera are kept, or None.
+
+    Attributes:
+        own: the run's own light.
+        lights: the lights that can be selected, by name.
+        moved: new positions of lamps that the user has moved, by the number of the lamp.
+        point: the surface point that was clicked last; None before a click and after one beside the surface.
+        painter: renders the requested images.
     """
 
     def __init__(
@@ -86,9 +93,13 @@ class Session:
         self.moved: dict[int, np.ndarray] = {}
         self.point: SurfacePoint | None = None
         self.painter = Painter(
-            lambda request: frames(request, shared.pace), self._show, self._failed, shared.lock
+            lambda request: frames(request, shared.speed), self._show, self._failed, shared.lock
         )
-        self._add_controls(previous)
+        self._add_header()
+        self._add_picture_controls(previous)
+        self._add_light_controls()
+        self._add_camera_controls()
+        self.status = client.gui.add_markdown("")
         self._add_lamps()
         self._add_cameras()
         if previous is None:
@@ -102,16 +113,19 @@ class Session:
         self.painter.stop()
         self.client.scene.reset()
         self.client.gui.reset()
+        # viser has no public way to remove the callbacks of a camera.
         self.client.camera._state.camera_cb.clear()
 
     # ----------------------------------------------------------------------------------------------- controls
 
-    def _add_controls(self, previous: Session | None) -> None:
+    def _add_header(self) -> None:
         gui, run = self.client.gui, self.subject.run
-        has_pbr = "pbr" in self.subject.layers
         gui.add_markdown(f"**{run.path.absolute().name}** · step {run.step}")
         if self.subject.note:
             gui.add_markdown(f"*{self.subject.note}*")
+
+    def _add_picture_controls(self, previous: Session | None) -> None:
+        gui = self.client.gui
         titles = [LAYERS[name] for name in self.subject.layers]
         keeps_layer = previous is not None and previous.layer.value in titles
         self.layer = gui.add_dropdown(
@@ -120,6 +134,9 @@ class Session:
         self.exposure = gui.add_slider("Exposure", -STOPS, STOPS, 0.25, 0.0, hint="Stops, for PBR and R")
         self.layer.on_update(lambda _: self._request())
         self.exposure.on_update(lambda _: self._request())
+
+    def _add_light_controls(self) -> None:
+        gui, has_pbr = self.client.gui, "pbr" in self.subject.layers
         with gui.add_folder("Light", visible=has_pbr):
             self.environment = gui.add_dropdown(
                 "Environment", list(self.lights), initial_value=next(iter(self.lights))
@@ -142,14 +159,16 @@ class Session:
             self.point_light = gui.add_image(
                 EMPTY_IMAGE, label="Incident light; up is at the top, directions below the surface are grey"
             )
+
+    def _add_camera_controls(self) -> None:
+        gui = self.client.gui
         with gui.add_folder("Cameras"):
-            names = [view.name for view in run.capture.views]
+            names = [view.name for view in self.subject.run.capture.views]
             self.cameras_on = gui.add_checkbox("Show", False)
             self.view = gui.add_dropdown("Go to", ["–", *names])
             self.photograph = gui.add_image(EMPTY_IMAGE, label="The photograph", visible=False)
         self.cameras_on.on_update(lambda _: self._show_cameras())
         self.view.on_update(lambda _: self._go_to(self.view.value))
-        self.status = gui.add_markdown("")
 
     def _lights(self) -> dict[str, Lighting]:
         """The lights that can be selected, by name. A free light cannot be replaced."""

@@ -1,7 +1,7 @@
-"""Samplers of distances along rays: uniform, by a distribution, or with bounded opacity error (VolSDF §3).
+"""The sampler of distances along rays, with bounded opacity error (VolSDF §3).
 
-The error-bounded sampler cuts a ray into intervals, bounds the error of the opacity under a density that is
-constant on each interval, and adds cuts where they lower that bound most. No gradient flows through samples.
+The sampler cuts a ray into intervals, bounds the error of the opacity under a density that is constant on
+each interval, and adds cuts where they lower that bound most. No gradient flows through samples.
 
 The rendered samples are of two kinds (published code): most are distributed by opacity, and the rest, with
 both ends of the ray, is spread over the whole ray, so that the density is also sampled where it is low.
@@ -11,14 +11,14 @@ Without the latter a ray that grazes a surface would be rendered too opaque.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.settings.types import VolumeConfig
-from neilfpp_method.shading.sampling import strata
+from neilfpp_method.stratified.intervals import inverse_cdf_samples, uniform_samples
 from neilfpp_method.structures import Indexable, RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
@@ -28,9 +28,9 @@ from neilfpp_method.volume.intersect import Interval
 __all__ = [
     "OPACITY_ERROR",
     "ErrorBoundedSamples",
+    "SampleCounts",
     "error_bounded_samples",
-    "inverse_cdf_samples",
-    "uniform_samples",
+    "sample_counts",
 ]
 
 OPACITY_ERROR = 0.1
@@ -42,48 +42,10 @@ BISECTIONS = 10
 SPREAD = 1 / 3
 """Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
 
-
-# -------------------------------------------------------------------------------------------- simple samplers
-
-
-@torch.no_grad()
-def uniform_samples(
-    near: Float[Tensor, " N"], far: Float[Tensor, " N"], count: int, stochastic: bool
-) -> Float[Tensor, "N {count}"]:
-    """`count` ascending distances: near, far, and one in each equal part between, random or central."""
-    within = torch.lerp(near[:, None], far[:, None], strata(near[:, None], count - 2, stochastic))
-    return torch.cat([near[:, None], within, far[:, None]], dim=-1)
-
-
-@torch.no_grad()
-def inverse_cdf_samples(
-    edges: Float[Tensor, "N E"], mass: Float[Tensor, "N E-1"], count: int, stochastic: bool
-) -> Float[Tensor, "N {count}"]:
-    """Stratified samples of a piecewise constant distribution, in ascending order.
-
-    A bin without mass gets no sample. If all bins are without mass, samples are uniform from the first to the
-    last edge.
-
-    Args:
-        edges: bounds of the bins, ascending; a bin may have width 0.
-        mass: probability mass of each bin, ≥ 0, up to a common factor.
-        count: samples per ray, one in each of `count` equal shares of the mass.
-        stochastic: whether samples are random within their share; if False, they are at its centre.
-    """
-    tiny = torch.finfo(edges.dtype).tiny
-    mass = mass.to(edges.dtype)
-    total = mass.sum(dim=-1, keepdim=True)
-    # Without mass, use the widths, at least `tiny` against a division by zero for rays of length 0.
-    mass = torch.where(total > tiny, mass / total.clamp_min(tiny), edges.diff(dim=-1).clamp_min(tiny))
-    cdf = torch.nn.functional.pad(mass.cumsum(dim=-1), (1, 0))
-    cdf = cdf / cdf[:, -1:]
-    # With u below 1, the first edge whose CDF exceeds u closes a bin that has mass.
-    u = strata(edges, count, stochastic).clamp_max(1.0 - torch.finfo(edges.dtype).eps)
-    end = torch.searchsorted(cdf, u, right=True).clamp_max(mass.shape[-1])
-    low, high = cdf.gather(-1, end - 1), cdf.gather(-1, end)
-    # The clamps only matter if a parallel sum has rounded neighbouring values of the CDF out of order.
-    fraction = ((u - low) / (high - low).clamp_min(tiny)).clamp(0.0, 1.0)
-    return torch.lerp(edges.gather(-1, end - 1), edges.gather(-1, end), fraction)
+CUTS, ROUNDS = 128, 5
+"""Cuts per ray in each round, and maximum number of refinement rounds (VolSDF Algorithm 1)."""
+SKIPPING_CUTS, SKIPPING_ROUNDS = 64, 2
+"""The same if rays skip empty space: what is left of them is short."""
 
 
 # -------------------------------------------------------------------------------------------- the error bound
@@ -157,7 +119,7 @@ def bound_shares(partition: Partition, beta: Float[Tensor, "N 1"]) -> Float[Tens
 
 
 def bounded_beta(
-    partition: Partition, beta: Float[Tensor, "#N 1"], beta_plus: Float[Tensor, "N 1"], config: VolumeConfig
+    partition: Partition, beta: Float[Tensor, "#N 1"], beta_plus: Float[Tensor, "N 1"]
 ) -> Float[Tensor, "N 1"]:
     """The smallest scale in [β, β₊] for which the bound is ≤ ε, by bisection; β₊ if there is none.
 
@@ -172,6 +134,32 @@ def bounded_beta(
 
 
 # ---------------------------------------------------------------------------------- the error-bounded sampler
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """Numbers of samples per ray.
+
+    Attributes:
+        cuts: SDF queries in the first round of the sampler and in each refinement round.
+        rounds: maximum number of refinement rounds.
+        rendered: samples that are rendered.
+    """
+
+    cuts: int
+    rounds: int
+    rendered: int
+
+    def of_narrowed_rays(self) -> SampleCounts:
+        """The counts for rays of which only the part that is not empty is sampled: half as many cuts."""
+        return replace(self, cuts=self.cuts // 2)
+
+
+def sample_counts(config: VolumeConfig) -> SampleCounts:
+    """The counts that suit the settings, for whole rays."""
+    if config.skip_empty:
+        return SampleCounts(SKIPPING_CUTS, SKIPPING_ROUNDS, config.samples)
+    return SampleCounts(CUTS, ROUNDS, config.samples)
 
 
 @dataclass(frozen=True)
@@ -196,12 +184,12 @@ def error_bounded_samples(
     rays: RayBatch,
     interval: Interval,
     beta: Float[Tensor, ""],
-    config: VolumeConfig,
+    counts: SampleCounts,
     stochastic: bool,
 ) -> ErrorBoundedSamples:
     """Sample rays so that the error of the opacity is at most ε (`OPACITY_ERROR`; VolSDF Algorithm 1).
 
-    A ray is cut uniformly. Then up to `config.rounds` times cuts are added where they lower the error bound
+    A ray is cut uniformly. Then up to `counts.rounds` times cuts are added where they lower the error bound
     most (`bound_shares`), until the bound at β is ≤ ε. Each round queries the SDF at the new cuts only. A ray
     whose rounds are used up is sampled with the smallest scale β₊ > β for which the bound is ≤ ε.
 
@@ -213,22 +201,22 @@ def error_bounded_samples(
         rays: the rays.
         interval: distances at which rays enter and leave the scene; near = far for a ray that misses it.
         beta: scale β of the density, scene units.
-        config: `initial_samples`, `rounds` and `samples` are used.
+        counts: numbers of samples per ray.
         stochastic: whether the cuts and the samples are random; if False, they are central.
     """
-    near, count = interval.near, len(rays)
+    near, number = interval.near, len(rays)
     beta = beta.to(near.dtype).reshape(1, 1)
-    samples = near.new_empty(count, config.samples)
+    samples = near.new_empty(number, counts.rendered)
     error_bound = torch.empty_like(near)
 
-    rows = torch.arange(count, device=near.device)
-    partition = first_cuts(sdf, rays, interval, config.initial_samples, stochastic)
+    rows = torch.arange(number, device=near.device)
+    partition = first_cuts(sdf, rays, interval, counts.cuts, stochastic)
     queries = partition.distances.numel()
     # The bound at this scale is ≤ ε even if the surface touched every interval (VolSDF Lemma 2).
     worst = partition.width.square().sum(dim=-1, keepdim=True).div(4.0 * math.log1p(OPACITY_ERROR)).sqrt()
     beta_plus = torch.maximum(worst, beta)
 
-    for rounds_left in reversed(range(config.rounds + 1)):
+    for rounds_left in reversed(range(counts.rounds + 1)):
         log_bound = log_error_bound(partition, beta)
         error_bound[rows] = log_bound[:, 0].exp().clamp_max(1.0)
         converged = log_bound <= math.log(OPACITY_ERROR)
@@ -236,18 +224,18 @@ def error_bounded_samples(
         if can_leave_early(near.device):
             done, left = converged[:, 0], ~converged[:, 0]
             samples[rows[done]] = opacity_samples(
-                partition[done], beta_plus[done], config.samples, stochastic
+                partition[done], beta_plus[done], counts.rendered, stochastic
             )
             rows, rays, partition, beta_plus = rows[left], rays[left], partition[left], beta_plus[left]
-        beta_plus = bounded_beta(partition, beta, beta_plus, config)
+        beta_plus = bounded_beta(partition, beta, beta_plus)
         if rounds_left == 0 or len(rows) == 0:
             break
         shares = bound_shares(partition, beta_plus)
-        partition = with_cuts(sdf, rays, partition, shares, config.initial_samples, stochastic)
-        queries += len(rows) * config.initial_samples
+        partition = with_cuts(sdf, rays, partition, shares, counts.cuts, stochastic)
+        queries += len(rows) * counts.cuts
 
-    samples[rows] = opacity_samples(partition, beta_plus, config.samples, stochastic)
-    return ErrorBoundedSamples(samples, error_bound, queries / max(count, 1))
+    samples[rows] = opacity_samples(partition, beta_plus, counts.rendered, stochastic)
+    return ErrorBoundedSamples(samples, error_bound, queries / max(number, 1))
 
 
 def can_leave_early(device: torch.device) -> bool:

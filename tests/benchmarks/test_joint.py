@@ -49,7 +49,7 @@ def test_every_query_of_the_sampler_is_counted(monkeypatch):
 
     monkeypatch.setattr(volsdf, "error_bounded_samples", listen)
     assert queries_per_ray(host, rays_at_the_table(64).rays) == pytest.approx(said[0].sdf_queries)
-    assert said[0].sdf_queries >= host.config.volume.initial_samples
+    assert said[0].sdf_queries >= host.sample_counts.cuts
 
 
 def test_steps_alternate_and_each_follows_one_of_its_kind():

@@ -28,7 +28,7 @@ def small_paper():
         radiance=dataclasses.replace(config.radiance, layers=2, width=32),
         brdf=dataclasses.replace(config.brdf, layers=4, width=32),
         light=dataclasses.replace(config.light, layers=4, width=32),
-        volume=dataclasses.replace(tiny.volume, initial_samples=32, rounds=3, samples=32, beta_init=0.01),
+        volume=dataclasses.replace(tiny.volume, samples=32, beta_init=0.01),
         shading=dataclasses.replace(config.shading, eval_samples=16, train_samples=16),
         loss=dataclasses.replace(config.loss, points="rays"),  # not drawn at random
     )

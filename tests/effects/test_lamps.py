@@ -73,7 +73,7 @@ def table_top() -> tuple[Observed, Material]:
 def test_the_solver_starts_with_lamps_that_held_back_views_do_not_contradict(gain, kept):
     observed, material = table_top()
     fast = preset("fast")
-    light = dataclasses.replace(fast.light, fit=dataclasses.replace(fast.light.fit, points=100, steps=60))
+    light = dataclasses.replace(fast.light, fit=dataclasses.replace(fast.light.fit, points=100))
     model = sphere_model(dataclasses.replace(fast, light=light))
     before = model.light.log_radiance.clone()
     judged = []

@@ -9,7 +9,7 @@ from neilfpp_method.fields.background import InvertedSphere
 from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 
 WAVES, GRID = FrequencyConfig(), HashGridConfig(levels=4, log2_entries=10, max_resolution=32)
-CONFIG = BackgroundConfig(layers=2, width=16, samples=8)
+CONFIG = BackgroundConfig(samples=8)
 
 
 def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
@@ -68,6 +68,12 @@ def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
     assert contracted[0].norm(dim=-1).max() < 2.0
 
 
+@pytest.mark.parametrize(("encoding", "layers", "width"), [(WAVES, 8, 256), (GRID, 2, 64)])
+def test_the_network_has_the_published_size(encoding, layers, width):
+    trunk = InvertedSphere(CONFIG, encoding, radius=2.0, scale=1.0).trunk
+    assert [layer.out_features for layer in trunk.layers] == [width] * layers + [1 + width]
+
+
 @pytest.mark.parametrize("start", [(0.25, 0.2, 0.15), (1.0, 0.5, 0.04)])
 def test_the_field_starts_with_the_given_color(start):
     torch.manual_seed(0)
@@ -90,7 +96,7 @@ def test_two_samples_by_hand():
     each half.
     """
     torch.manual_seed(0)
-    field = InvertedSphere(BackgroundConfig(layers=2, width=16, samples=2), WAVES, radius=4.0, scale=1.0)
+    field = InvertedSphere(BackgroundConfig(samples=2), WAVES, radius=4.0, scale=1.0)
     with torch.no_grad():
         field.trunk.layers[-1].weight[0].zero_()
         field.trunk.layers[-1].bias[0] = 0  # softplus(0) = ln 2

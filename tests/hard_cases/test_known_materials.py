@@ -46,7 +46,7 @@ def closed_form_host(origins: torch.Tensor, directions: torch.Tensor) -> tuple[t
 def settings(steps: int, known_map: Path | None, samples: int) -> NeilfConfig:
     """A small material field trained for `steps` steps, under a known map or a map that is fitted."""
     config = solved_light(tiny_config())
-    fit = dataclasses.replace(config.light.fit, points=512, every=50, steps=60)
+    fit = dataclasses.replace(config.light.fit, points=512, every=50)
     light = dataclasses.replace(
         config.light,
         kind="distant",

@@ -38,7 +38,7 @@ def settings() -> NeilfConfig:
         host=dataclasses.replace(config.host, sdf=dataclasses.replace(config.host.sdf, width=32)),
         encoding=HashGridConfig(levels=4, log2_entries=13, sdf_log2_entries=13, max_resolution=64),
         radiance=dataclasses.replace(config.radiance, width=32),
-        volume=dataclasses.replace(config.volume, beta_init=0.05, initial_samples=32, samples=24),
+        volume=dataclasses.replace(config.volume, beta_init=0.05, samples=24),
     )
 
 

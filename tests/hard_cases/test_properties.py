@@ -28,10 +28,10 @@ from neilfpp_method.settings.types import FrequencyConfig, HashGridConfig
 from neilfpp_method.shading import LOBES, Sampling, evaluate, sample_directions, srgb_to_linear
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.color import linear_to_srgb, residual
+from neilfpp_method.stratified.intervals import inverse_cdf_samples
 from neilfpp_method.structures import Material
 from neilfpp_method.volume.compositing import depth_weights
 from neilfpp_method.volume.density import laplace_density, laplace_depth
-from neilfpp_method.volume.samplers import inverse_cdf_samples
 from tests.hard_cases.test_fields import gradients
 from tests.lighting.surfaces import material, points
 

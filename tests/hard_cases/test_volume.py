@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.stratified.intervals import inverse_cdf_samples
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.compositing import composite, render_weights
 from neilfpp_method.volume.density import laplace_density
 from neilfpp_method.volume.intersect import Interval, sphere_interval
-from neilfpp_method.volume.samplers import error_bounded_samples, inverse_cdf_samples
+from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples
 from tests.scenes import sphere_distance
 
-CONFIG = VolumeConfig(initial_samples=16, samples=8)
+COUNTS = SampleCounts(cuts=16, rounds=5, rendered=8)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -57,7 +57,7 @@ def test_samples_are_ordered_and_within_their_interval(beta, stochastic, dtype):
     interval = sphere_interval(origins, directions, 3.0)
     scale = torch.tensor(beta, dtype=dtype)
     found = error_bounded_samples(
-        sphere_distance, RayBatch(origins, directions), interval, scale, CONFIG, stochastic
+        sphere_distance, RayBatch(origins, directions), interval, scale, COUNTS, stochastic
     )
     assert found.distances.dtype == dtype
     assert found.distances.isfinite().all()
@@ -78,7 +78,7 @@ def test_sampler_with_a_constant_sdf(constant):
         RayBatch(origins, directions),
         Interval(torch.zeros(2), far),
         torch.tensor(1e-4),
-        CONFIG,
+        COUNTS,
         False,
     )
     assert found.distances.isfinite().all()
@@ -92,7 +92,7 @@ def test_sampler_takes_a_half_precision_sdf():
         RayBatch(origins, directions),
         Interval(torch.tensor([0.0]), torch.tensor([4.0])),
         torch.tensor(0.01),
-        CONFIG,
+        COUNTS,
         False,
     )
     assert found.distances.dtype == torch.float32
@@ -111,6 +111,6 @@ def test_inverse_cdf_of_a_uniform_mass_is_uniform(mass, span):
 def test_an_empty_batch_of_rays():
     empty = torch.zeros(0)
     rays, interval = RayBatch(torch.zeros(0, 3), torch.zeros(0, 3)), Interval(empty, empty)
-    found = error_bounded_samples(sphere_distance, rays, interval, torch.tensor(0.1), CONFIG, True)
+    found = error_bounded_samples(sphere_distance, rays, interval, torch.tensor(0.1), COUNTS, True)
     assert found.distances.shape == (0, 8)
     assert found.sdf_queries == 0

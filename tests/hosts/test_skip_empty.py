@@ -12,6 +12,7 @@ from neilfpp_method.incident import traced
 from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.volume import empty_space
+from neilfpp_method.volume.samplers import SampleCounts
 from tests.scenes import sphere_batch, tiny_config
 
 
@@ -32,8 +33,7 @@ def _coarse(monkeypatch):
 def test_images_skip_empty_space_and_agree_with_whole_rays():
     skipping, plain = host().eval(), host(skip=False).eval()
     plain.load_state_dict(skipping.state_dict(), strict=False)
-    fine = dataclasses.replace(plain.config.volume, initial_samples=256, rounds=4, samples=128)
-    plain.config = dataclasses.replace(plain.config, volume=fine)
+    plain.sample_counts = SampleCounts(cuts=256, rounds=4, rendered=128)
     rays = sphere_batch(200, spread=1.2).rays
     with torch.no_grad():
         found, true = skipping.render(rays), plain.render(rays)
@@ -57,7 +57,8 @@ def test_rays_that_miss_do_not_query_the_field(monkeypatch):
         skipping.render(rays)
         skipping.render(rays[torch.nonzero(whole.opacity < 1e-9)[:, 0]])
     met = int((whole.opacity > 1e-3).sum())
-    assert met * 16 <= sum(asked) < 200 * 24
+    counts = skipping.sample_counts
+    assert met * counts.of_narrowed_rays().cuts <= sum(asked) < 200 * counts.cuts
 
 
 def test_images_follow_a_field_that_changes():
@@ -92,6 +93,7 @@ def test_images_follow_a_field_that_is_trained(fused):
 
 def test_evaluation_with_gradients_samples_whole_rays():
     skipping, plain = host().eval(), host(skip=False).eval()
+    plain.sample_counts = skipping.sample_counts
     plain.load_state_dict(skipping.state_dict(), strict=False)
     rays = sphere_batch().rays
     torch.manual_seed(1)

@@ -26,8 +26,7 @@ def thin_surface(background: str = "constant") -> VolSdfHost:
     """The sphere with a thin surface layer."""
     config = tiny_config()
     config = dataclasses.replace(
-        config,
-        volume=dataclasses.replace(config.volume, beta_init=2e-3, initial_samples=64, rounds=4, samples=64),
+        config, volume=dataclasses.replace(config.volume, beta_init=2e-3, samples=64)
     )
     return sphere_model(config, background=background).eval().host
 

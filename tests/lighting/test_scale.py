@@ -28,7 +28,7 @@ def brightness_after_drift(begins: bool) -> float:
     """Factor on the radiance of the map by a fit after base colours have become darker by `DRIFT`."""
     torch.manual_seed(0)
     fast = preset("fast")
-    fit = dataclasses.replace(fast.light.fit, points=400, every=1, steps=60)
+    fit = dataclasses.replace(fast.light.fit, points=400, every=1)
     light = dataclasses.replace(fast.light, kind="distant", environment_height=8, fit=fit)
     model = sphere_model(dataclasses.replace(fast, light=light))
     true = EnvironmentLight(8, 1.0)

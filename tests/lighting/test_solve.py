@@ -24,7 +24,8 @@ from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, patches
 
-CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800, steps=150))
+CONFIG = MapLightConfig(kind="auto", environment_height=12, fit=LightFitConfig(points=800))
+STEPS = 150
 LAMP = torch.tensor([[0.3, -0.2, 0.5]])
 BULB = LampPlaces(LAMP, torch.zeros(1, 3))
 """Sends alike in all directions."""
@@ -68,7 +69,7 @@ def solve(
     base_color_known: bool = False,
 ) -> Evidence | None:
     """Solve for the light of open points of known roughness, in units of their median pixel."""
-    objective = Objective("linear", seen.pixel.median().item(), config.fit.steps, base_color_known)
+    objective = Objective("linear", seen.pixel.median().item(), STEPS, base_color_known)
     return solve_light(light, FitPoints(seen, of, GGX, None), objective, config, first)
 
 
@@ -187,7 +188,7 @@ def test_lamps_without_a_significant_gain_are_lit_only_with_lamps_if_undecided(m
     for doubt in (False, True):
         torch.manual_seed(0)
         light, unit = LightModel(EnvironmentLight(12, 0.7), Lamps(4, 0.06)), seen.pixel.median().item()
-        objective = Objective("linear", unit, CONFIG.fit.steps)
+        objective = Objective("linear", unit, STEPS)
         points = FitPoints(seen, of, GGX, None)
         solve_light(light, points, objective, CONFIG, first=False, lamps_if_undecided=doubt)
         lit.append(light.lamps.count)

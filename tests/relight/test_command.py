@@ -133,7 +133,7 @@ def test_existing_images_are_not_rendered_again(given, sky, tmp_path, capfd):
 
 def test_the_default_number_of_samples_is_the_same_setting_as_that_number(given, sky, tmp_path, monkeypatch):
     options = ["--env", str(sky), "--out", str(tmp_path), "--resolution", "32", "--device", "cpu"]
-    monkeypatch.setattr(command, "SAMPLES", 3)
+    monkeypatch.setattr("neilfpp_method.relight.request.SAMPLES", 3)
     assert main(["relight", str(given), *options]) == 0
     record = tmp_path / "studio" / "000.json"
     assert json.loads(record.read_text())["spp"] == 3

@@ -10,7 +10,7 @@ from neilfpp_method.data.views import Camera
 from neilfpp_method.relight import film
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
-from neilfpp_method.relight.sequence import Sequence
+from neilfpp_method.relight.sequence import SobolSequence
 from tests.relight.test_path_tracer import EVEN, ball, made_of
 
 
@@ -75,7 +75,7 @@ def test_more_samples_are_more_accurate(scene):
 
 
 def test_numbers_are_evenly_spread_and_differ_between_pixels():
-    numbers = Sequence(4, seed=1).next(256, 5)
+    numbers = SobolSequence(4, seed=1).next(256, 5)
     u = numbers.at(torch.arange(5 * 256), 1, 2)
     assert u.min() >= 0
     assert u.max() < 1
@@ -86,14 +86,14 @@ def test_numbers_are_evenly_spread_and_differ_between_pixels():
     first = u[numbers.sample == 0, 0]
     assert len(first.unique()) == 5
     # Generated in blocks, the sequence is the same.
-    halves = Sequence(4, seed=1)
+    halves = SobolSequence(4, seed=1)
     pair = [halves.next(128, 5) for _ in range(2)]
     again = torch.cat([part.at(torch.arange(5 * 128), 1, 2) for part in pair])
     assert torch.equal(again, u)
 
 
 def test_shifts_are_spread_evenly():
-    numbers = Sequence(1, seed=9).next(1, 100_000)
+    numbers = SobolSequence(1, seed=9).next(1, 100_000)
     u = numbers.at(torch.arange(100_000), 0, 1)[:, 0]
     counts = (u * 50).long().bincount(minlength=50).double()
     assert ((counts - 2000).square() / 2000).sum() < 85.4  # χ² with 49 degrees of freedom, 1 in 1000

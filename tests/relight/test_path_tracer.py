@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.relight import path_tracer
 from neilfpp_method.relight.lamplight import Lamplight
 from neilfpp_method.relight.path_tracer import DIMENSIONS, Scene, power_heuristic, trace_paths
-from neilfpp_method.relight.sequence import Sequence
+from neilfpp_method.relight.sequence import SobolSequence
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.shading.brdf import GGX, SPHERICAL_GAUSSIAN
@@ -46,7 +46,10 @@ def squares(*corners) -> Surface:
 
 def trace(scene: Scene, rays: RayBatch, samples: int, bounces: int) -> torch.Tensor:
     """Mean radiance of each ray (N, 3)."""
-    sequence, total = Sequence(bounces * DIMENSIONS, seed=7), torch.zeros(len(rays), 3, dtype=torch.float64)
+    sequence, total = (
+        SobolSequence(bounces * DIMENSIONS, seed=7),
+        torch.zeros(len(rays), 3, dtype=torch.float64),
+    )
     numbers = sequence.next(samples, len(rays))
     traced = trace_paths(scene, rays[numbers.pixel], numbers, bounces)
     return total.index_add_(0, numbers.pixel, traced.radiance.double()) / samples
@@ -210,7 +213,7 @@ def test_a_lamp_casts_a_shadow():
 def test_cameras_see_neither_lamps_nor_sky():
     lamps = Lamplight(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3), torch.ones(1, 3), 0.2)
     rays = looking_at([(0.0, 0.0, 0.0), (5.0, 0.0, 0.0)])
-    numbers = Sequence(DIMENSIONS, 0).next(1, 2)
+    numbers = SobolSequence(DIMENSIONS, 0).next(1, 2)
     traced = trace_paths(Scene(ball(), made_of(0.0), None, EVEN, lamps), rays, numbers, 1)
     assert not traced.radiance.any()
     assert traced.alpha.tolist() == [1.0, 0.0]

@@ -9,6 +9,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import (
     apply_response,
     at_common_exposure,
+    display_values,
     linear_to_srgb,
     luminance,
     residual,
@@ -42,6 +43,12 @@ def test_a_response_is_the_identity_or_the_clipped_srgb_curve():
     # 1.055 · 0.25^(1/2.4) − 0.055 = 0.53710
     assert apply_response(color, "srgb").allclose(torch.tensor([0.0, 0.0, 0.53710, 1.0, 1.0]), atol=1e-5)
     assert torch.equal(tone_map(color), apply_response(color, "srgb"))
+
+
+def test_display_values_are_clipped_in_either_response():
+    pixel = torch.tensor([-1.0, 0.25, 7.0])
+    assert display_values(pixel, "linear").allclose(torch.tensor([0.0, 0.53710, 1.0]), atol=1e-5)
+    assert display_values(pixel, "srgb").tolist() == [0.0, 0.25, 1.0]
 
 
 def test_an_undetermined_response_is_refused():

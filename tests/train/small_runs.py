@@ -47,7 +47,7 @@ def solved_light(config: NeilfConfig) -> NeilfConfig:
     visibility.
     """
     fast = preset("fast")
-    fit = dataclasses.replace(fast.light.fit, points=32, every=3, steps=5)
+    fit = dataclasses.replace(fast.light.fit, points=32, every=3)
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
@@ -90,7 +90,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
         light_solver=model.light_solver(),
         watch=Watch(pixels.sample(64), listener.warn),
         plan=Plan.begin(EffectRequest("as-set"), config),
-        quality=Quality(hold_back(pixels, config.train.seed, patches), capture.hdr),
+        quality=Quality(hold_back(pixels, config.train.seed, patches)),
     )
 
 

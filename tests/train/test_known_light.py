@@ -26,7 +26,7 @@ from tests.train.small_runs import small_config
 def mapped_config() -> NeilfConfig:
     """Milliseconds per step, with an environment map and lamps that are fitted at every second step."""
     config = small_config()
-    fit = LightFitConfig(points=60, every=2, steps=4)
+    fit = LightFitConfig(points=60, every=2)
     return dataclasses.replace(
         config,
         light=MapLightConfig(kind="auto", environment_height=6, fit=fit),

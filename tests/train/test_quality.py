@@ -60,7 +60,7 @@ def test_checks_do_not_change_the_training_and_continue_after_a_stop(tmp_path, c
 
 def test_the_psnr_is_that_of_clipped_srgb_values():
     """R and PBR of a model compared with pixels at a known difference in display values."""
-    model = sphere_model()
+    model = sphere_model(response="srgb")
     model.eval()
     batch = sphere_batch(32)
     maps = model.maps(batch.rays)
@@ -68,7 +68,7 @@ def test_the_psnr_is_that_of_clipped_srgb_values():
         # A photograph that is brighter than R by `off` in display values, unless that clips.
         shown = quality.tone_map(maps.rgb_volume)
         batch.color.copy_(shown + torch.where(shown > 0.5, -off, off))
-        watch = Quality(batch, hdr=False)
+        watch = Quality(batch)
         watch.check_when_due(model.train(), StagePosition(Stage.JOINT, 4, 4), 12, 1.0)
         assert watch.checks[0].radiance == pytest.approx(-20 * math.log10(off), abs=1e-3)
         assert watch.checks[0].physical is not None
@@ -77,7 +77,7 @@ def test_the_psnr_is_that_of_clipped_srgb_values():
 
 def test_checks_are_rare_and_cheap(monkeypatch):
     monkeypatch.setattr(quality, "_measure", lambda *_: quality._Measured(20.0, None))
-    watch = Quality(sphere_batch(4), hdr=True)
+    watch = Quality(sphere_batch(4))
     model = sphere_model()
     for number in range(1, 3001):
         watch.check_when_due(model, StagePosition(Stage.SDF_INIT, number, 3000), number, 1e9)
@@ -86,7 +86,7 @@ def test_checks_are_rare_and_cheap(monkeypatch):
         watch.check_when_due(model, StagePosition(Stage.JOINT, number, 500), 3000 + number, 1e9)
     assert [check.step for check in watch.checks[10:]] == [3200, 3400, 3500]
     # Checks that took too much time are postponed, except that at the end of a stage.
-    watch = Quality(sphere_batch(4), True, [QualityCheck(10, "sdf_init", 10.0, 1.0, None, took=1.0)])
+    watch = Quality(sphere_batch(4), [QualityCheck(10, "sdf_init", 10.0, 1.0, None, took=1.0)])
     for seconds, checks in ((0.9 / MAX_SHARE, 1), (1.1 / MAX_SHARE, 2)):
         watch.check_when_due(model, StagePosition(Stage.JOINT, 400, 900), 1000, seconds)
         assert len(watch.checks) == checks

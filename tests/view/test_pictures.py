@@ -14,8 +14,8 @@ from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.incident_map import light_at, light_picture, point_under
-from neilfpp_method.view.pace import RenderSpeed
 from neilfpp_method.view.pictures import BOUNCES, FAR, PictureRequest, ViewerFrame, frames
+from neilfpp_method.view.speed import RenderSpeed
 from neilfpp_method.view.subject import Lighting, own_light, scene_of, subject_of
 
 

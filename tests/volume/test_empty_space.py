@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
-from neilfpp_method.settings.types import VolumeConfig
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import empty_space
 from neilfpp_method.volume.compositing import depth_weights
@@ -20,10 +19,11 @@ from neilfpp_method.volume.density import laplace_density, laplace_depth
 from neilfpp_method.volume.distance_grid import cell_size
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import sphere_interval
-from neilfpp_method.volume.samplers import error_bounded_samples
+from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples
 from tests.scenes import sphere_distance
 
 RADIUS = 1.75
+COUNTS = SampleCounts(cuts=128, rounds=5, rendered=64)
 CELL = 2 * RADIUS / (empty_space.RESOLUTION - 1)
 
 
@@ -130,8 +130,7 @@ def test_fewer_queries_find_the_same_surface(sdf):
     assert opaque.sum() > 40
 
     def run(interval):
-        config = VolumeConfig(radius=RADIUS, samples=64)
-        found = error_bounded_samples(sdf, rays, interval, torch.tensor(beta), config, False)
+        found = error_bounded_samples(sdf, rays, interval, torch.tensor(beta), COUNTS, False)
         t = found.distances
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
         depth = laplace_depth(sdf(points.reshape(-1, 3)).view_as(t), t, torch.tensor(beta))

@@ -8,9 +8,9 @@ import math
 import numpy as np
 import pytest
 import torch
-from scipy.stats import chisquare, kstest, laplace
+from scipy.stats import laplace
 
-from neilfpp_method.settings.types import VolumeConfig
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
@@ -19,15 +19,15 @@ from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
     SPREAD,
+    SampleCounts,
     cut,
     error_bounded_samples,
-    inverse_cdf_samples,
-    uniform_samples,
+    sample_counts,
 )
 from tests.scenes import sphere_distance
 
 F64 = torch.float64
-CONFIG = VolumeConfig()
+COUNTS = SampleCounts(cuts=128, rounds=5, rendered=98)
 TILT = torch.tensor([0.36, 0.48, 0.8], dtype=F64)  # a unit vector
 
 
@@ -58,67 +58,11 @@ def ray_bundle(count, dtype=F64):
     )
 
 
-def sample(sdf, rays, beta, config=CONFIG, stochastic=False):
+def sample(sdf, rays, beta, counts=COUNTS, stochastic=False):
     origins, directions, near, far = rays
     beta = torch.tensor(beta, dtype=near.dtype)
     interval = Interval(near, far)
-    return error_bounded_samples(sdf, RayBatch(origins, directions), interval, beta, config, stochastic)
-
-
-# -------------------------------------------------------------------------------------------- simple samplers
-
-
-def test_uniform_samples_are_both_ends_and_the_centers_of_equal_parts():
-    samples = uniform_samples(torch.tensor([0.0, 1.0]), torch.tensor([4.0, 1.0]), 6, False)
-    assert samples.tolist() == [[0.0, 0.5, 1.5, 2.5, 3.5, 4.0], [1.0] * 6]
-
-
-def test_random_uniform_samples_have_one_in_each_part():
-    torch.manual_seed(0)
-    samples = uniform_samples(torch.full((4000,), 2.0), torch.full((4000,), 6.0), 6, True)[:, 1:-1]
-    assert (samples.floor() == torch.tensor([2.0, 3.0, 4.0, 5.0])).all()
-    assert kstest((samples - samples.floor()).flatten().numpy(), "uniform").pvalue > 1e-3
-
-
-def test_inverse_cdf_by_hand():
-    edges, mass = torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[2.0, 2.0]])
-    # u = 1/8, 3/8 | 5/8, 7/8: half of the mass lies in [0, 1], half in [1, 3].
-    assert inverse_cdf_samples(edges, mass, 4, False).tolist() == [[0.25, 0.75, 1.5, 2.5]]
-
-
-def test_inverse_cdf_draws_from_a_piecewise_constant_density():
-    torch.manual_seed(0)
-    edges = torch.tensor([0.0, 0.5, 0.6, 1.5, 1.5, 2.0, 4.0], dtype=F64)
-    mass = torch.tensor([0.1, 0.4, 0.0, 0.0, 0.3, 0.2], dtype=F64)
-    draws = 20_000
-    # One sample per row: independent, as the χ² test requires.
-    samples = inverse_cdf_samples(edges.expand(draws, 7), mass.expand(draws, 6), 1, True)[:, 0].numpy()
-    counts = np.histogram(samples, edges.numpy()[[0, 1, 2, 4, 5, 6]])[0]
-    assert counts[2] == 0  # the flat part of the CDF
-    assert chisquare(counts[[0, 1, 3, 4]], draws * np.array([0.1, 0.4, 0.3, 0.2])).pvalue > 1e-3
-    within = samples[(samples > 2.0)] / 2.0 - 1.0
-    assert kstest(within, "uniform").pvalue > 1e-3
-
-
-@pytest.mark.parametrize("stochastic", [False, True])
-def test_inverse_cdf_gives_one_sample_to_each_share_and_none_to_flat_parts(stochastic):
-    mass = torch.tensor([[0.0, 1.0, 0.0, 0.0, 3.0, 0.0]])
-    samples = inverse_cdf_samples(torch.arange(7.0)[None], mass, 64, stochastic)
-    assert ((samples >= 1.0) & (samples <= 2.0)).sum() == 16
-    assert ((samples >= 4.0) & (samples <= 5.0)).sum() == 48
-    assert (samples.diff(dim=-1) >= 0.0).all()
-
-
-def test_inverse_cdf_without_mass_is_uniform_in_length():
-    samples = inverse_cdf_samples(torch.tensor([[0.0, 3.0, 4.0]]), torch.zeros(1, 2), 4, False)
-    torch.testing.assert_close(samples, torch.tensor([[0.5, 1.5, 2.5, 3.5]]))
-
-
-@pytest.mark.parametrize(("u", "mass", "where"), [(0.0, [0.0, 1.0, 1.0], 1.0), (1.0, [1.0, 1.0, 0.0], 2.0)])
-def test_inverse_cdf_at_its_ends_stays_in_bins_with_mass(monkeypatch, u, mass, where):
-    monkeypatch.setattr(samplers, "strata", lambda like, count, stochastic: torch.full((1, count), u))
-    samples = inverse_cdf_samples(torch.arange(4.0)[None], torch.tensor([mass]), 1, True)
-    assert samples.item() == pytest.approx(where, abs=1e-6)
+    return error_bounded_samples(sdf, RayBatch(origins, directions), interval, beta, counts, stochastic)
 
 
 # -------------------------------------------------------------------------------------------- the error bound
@@ -189,7 +133,7 @@ def opacity_error(sdf, rays, beta, cuts):
 @pytest.mark.parametrize("beta", [0.1, 0.02, 0.005])
 @pytest.mark.parametrize("rounds", [0, 5])
 def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta, rounds):
-    config = dataclasses.replace(CONFIG, rounds=rounds)
+    counts = dataclasses.replace(COUNTS, rounds=rounds)
     bundle = ray_bundle(4)
     for i in range(4):
         ray = [part[i : i + 1] for part in bundle]
@@ -199,15 +143,22 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
             asked.append((x - ray[0]) @ ray[1][0])
             return sdf(x)
 
-        found = sample(recorded, ray, beta, config)
+        found = sample(recorded, ray, beta, counts)
         error = opacity_error(sdf, ray, beta, torch.cat(asked).sort().values)
         assert error <= found.error_bound.item() + 1e-5
         if rounds:
             assert found.error_bound.item() <= OPACITY_ERROR
 
 
+def test_rays_that_skip_empty_space_are_cut_less_often():
+    skipping = sample_counts(preset("fast").volume)
+    assert skipping == SampleCounts(cuts=64, rounds=2, rendered=32)
+    assert skipping.of_narrowed_rays() == SampleCounts(cuts=32, rounds=2, rendered=32)
+    assert sample_counts(preset("paper-mlp").volume) == COUNTS
+
+
 def test_the_bound_shows_when_the_rounds_were_too_few():
-    found = sample(sphere_distance, ray_bundle(16), 1e-4, dataclasses.replace(CONFIG, rounds=0))
+    found = sample(sphere_distance, ray_bundle(16), 1e-4, dataclasses.replace(COUNTS, rounds=0))
     assert (found.error_bound > OPACITY_ERROR).any()
     assert found.distances.isfinite().all()
 
@@ -260,7 +211,7 @@ def test_samples_follow_the_true_opacity():
     origins, directions = torch.zeros(1, 3, dtype=F64), torch.tensor([[0.0, 0.0, 1.0]], dtype=F64)
     rays = (origins, directions, torch.zeros(1, dtype=F64), torch.full((1,), 4.0, dtype=F64))
     beta = 0.1
-    found = sample(lambda x: 1.0 - x[:, 2], rays, beta, dataclasses.replace(CONFIG, samples=512))
+    found = sample(lambda x: 1.0 - x[:, 2], rays, beta, dataclasses.replace(COUNTS, rendered=512))
     t = found.distances[0].numpy()
     # The antiderivative of Ψ(t − 1)/β: ½ e^{(t−1)/β} before the plane, ½ e^{−(t−1)/β} + (t − 1)/β behind it.
     depth = np.where(t < 1, 0.5 * np.exp((t - 1) / beta), 0.5 * np.exp(-(t - 1) / beta) + (t - 1) / beta)
@@ -337,6 +288,6 @@ def test_samples_have_no_gradient():
     beta = torch.tensor(0.02, dtype=F64, requires_grad=True)
     origins, directions, near, far = ray_bundle(2)
     rays, interval = RayBatch(origins, directions), Interval(near, far)
-    found = error_bounded_samples(sphere_distance, rays, interval, beta, CONFIG, True)
+    found = error_bounded_samples(sphere_distance, rays, interval, beta, COUNTS, True)
     assert not found.distances.requires_grad
     assert not found.error_bound.requires_grad

@@ -26,6 +26,8 @@ CHANNELS = {
     "normal": slice(5, 8),
 }
 """Channels of the array that all textures are baked into; expected errors follow after them."""
+FIRST_ERROR, CHANNELS_WITH_ERRORS = 8, 11
+"""Channel of the first expected error, and number of channels if there are three of them."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def bake(
         on_progress: called with the fraction of the work that is done.
     """
     tracer, tangents = first_hits(detail.surface), vertex_tangents(mesh)
-    texture = np.zeros((size * size, 8 if deviation is None else 11), np.uint8)
+    texture = np.zeros((size * size, FIRST_ERROR if deviation is None else CHANNELS_WITH_ERRORS), np.uint8)
     covered = np.zeros(size * size, bool)
     for texels in covered_texels(mesh, size):
         position = texels.interpolate(mesh.vertices, mesh.faces)
@@ -111,7 +113,7 @@ def bake(
     return Textures(
         **{name: dilated[..., channels] for name, channels in CHANNELS.items()},
         covered=float(covered.mean()),
-        deviation=None if deviation is None else dilated[..., 8:],
+        deviation=None if deviation is None else dilated[..., FIRST_ERROR:],
     )
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.export.mesh import surface_mesh
-from neilfpp_method.hosts.base import SmoothsNormals
+from neilfpp_method.export.mesh import shading_normals, surface_mesh
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.shading.frame import safe_normalize
@@ -20,8 +19,6 @@ from neilfpp_method.train.run import Run
 
 __all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "meet_along"]
 
-POINTS_AT_ONCE = 2**14
-"""Number of points per call of the host's normal smoothing, which reads 32 neighbours of each."""
 STEP_BACK = 1e-4
 """Distance that a ray starts behind its point, scene units, so that it hits a surface through the point."""
 
@@ -57,13 +54,14 @@ def fine_surface(run: Run, resolution: int) -> AssetSurface:
     mesh, host = surface_mesh(run, resolution), run.model.host
     faces, vertices = np.array(mesh.faces), np.array(mesh.vertices, dtype=np.float64)
     if isinstance(host, MeshHost):
-        position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
-        return AssetSurface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
+        corner, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
+        normals = shading_normals(run, corner, normal).double().cpu().numpy()
+        return AssetSurface(vertices, faces, normals.reshape(-1, 3, 3))
     position, normal = (
         torch.as_tensor(np.array(a), dtype=torch.float32, device=run.device)
         for a in (vertices, mesh.vertex_normals)
     )
-    return AssetSurface(vertices, faces, _shading_normals(host, position, normal)[faces])
+    return AssetSurface(vertices, faces, shading_normals(run, position, normal).double().cpu().numpy()[faces])
 
 
 def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> AssetSurface:
@@ -136,13 +134,3 @@ def meet_along(
         nearest[rows], valid[rows], hit_normal[rows] = distance, True, shaded[nearer]
         hit_position[rows] = start[rows] + hit.distance[nearer, None] * direction[rows]
     return NormalHits(valid.numpy(), nearest.numpy(), hit_position.numpy(), hit_normal.numpy())
-
-
-def _shading_normals(
-    host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
-) -> Float[np.ndarray, "N 3"]:
-    """Normals that the host uses for shading, smoothed if it smooths them."""
-    if isinstance(host, SmoothsNormals):
-        pairs = zip(position.split(POINTS_AT_ONCE), normal.split(POINTS_AT_ONCE), strict=True)
-        normal = torch.cat([host.smooth_normals(places, normals) for places, normals in pairs])
-    return normal.double().cpu().numpy()

@@ -25,21 +25,21 @@ NEW_WEIGHT = 0.5
 class RenderSpeed:
     """Measured rendering speed by layer, rays per second."""
 
-    speed: dict[str, float] = field(default_factory=dict)
+    by_layer: dict[str, float] = field(default_factory=dict)
 
     def note(self, layer: str, rays: int, seconds: float) -> None:
         """Add a measurement."""
         measured = rays / max(seconds, 1e-6)
-        before = self.speed.get(layer, measured)
-        self.speed[layer] = (1 - NEW_WEIGHT) * before + NEW_WEIGHT * measured
+        before = self.by_layer.get(layer, measured)
+        self.by_layer[layer] = (1 - NEW_WEIGHT) * before + NEW_WEIGHT * measured
 
     def first_image(self, layer: str) -> int:
         """Number of rays of a first image."""
-        return max(MIN_RAYS, int(FIRST_IMAGE * self.speed.get(layer, DEFAULT_SPEED)))
+        return max(MIN_RAYS, int(FIRST_IMAGE * self.by_layer.get(layer, DEFAULT_SPEED)))
 
     def batch(self, layer: str) -> int:
         """Number of rays of a batch."""
-        return max(MIN_RAYS, int(BATCH * self.speed.get(layer, DEFAULT_SPEED)))
+        return max(MIN_RAYS, int(BATCH * self.by_layer.get(layer, DEFAULT_SPEED)))
 
 
 def sizes(width: int, height: int, at_once: int) -> list[float]:

@@ -1,0 +1,1 @@
+"""Random and evenly spaced numbers on intervals, one in each of equal parts."""
