@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.mesh import extract_mesh
-from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
+from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.train.run import Run
 
 __all__ = ["check_material", "surface_of_run"]
-
-NORMALS_AT_ONCE = 2**14
-"""Number of points per call of the host's normal smoothing, which bounds the memory."""
 
 
 def check_material(run: Run) -> None:
@@ -32,7 +27,9 @@ def check_material(run: Run) -> None:
 
 
 @torch.no_grad()
-def surface_of_run(run: Run, resolution: int) -> Surface:
+def surface_of_run(
+    run: Run, resolution: int, say: Callable[[str], None] = lambda text: None, keep: bool = True
+) -> Surface:
     """Return the mesh the run was given, or the one that `neilfpp export --what mesh` extracts.
 
     Shading normals are those of training: the host's normals, smoothed if the host smooths them.
@@ -40,35 +37,26 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
     Args:
         run: the trained run.
         resolution: number of cells along an edge of the scene's cube when a mesh is extracted.
+        say: receives a message if a file in the run folder is replaced.
+        keep: whether an extracted mesh is kept in the run folder.
 
     Raises:
         UserError: the run has no surface.
     """
-    host, device = run.model.host, run.device
+    host = run.model.host
     if isinstance(host, MeshHost):
         triangles, normals = host.triangles.float(), host.corner_normals.float()
-        if isinstance(host, SmoothsNormals) and run.config.volume.normal_radius > 0:
-            smooth = _smoothed(host, triangles.reshape(-1, 3), normals.reshape(-1, 3))
-            normals = smooth.view_as(triangles)
-        return Surface(triangles, normals)
+        smooth = shading_normals(host, triangles.reshape(-1, 3), normals.reshape(-1, 3))
+        return Surface(triangles, smooth.view_as(triangles))
     if not isinstance(host, HasSdf):
         raise UserError(
             f"{run.path}: the host of this run has no surface to trace",
             "use a run of the VolSDF or mesh host",
         )
-    mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=device)
-    vertices, normals = (
-        torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device)
-        for part in (mesh.vertices, mesh.vertex_normals)
+    surface = extracted_surface(run, resolution, shaded=True, say=say, keep=keep)
+    assert surface.normals is not None
+    faces = surface.faces
+    triangles, corner_normals = (
+        torch.from_numpy(values[faces]).to(run.device) for values in (surface.vertices, surface.normals)
     )
-    if isinstance(host, SmoothsNormals):
-        normals = _smoothed(host, vertices, normals)
-    faces = torch.from_numpy(np.asarray(mesh.faces, dtype=np.int64)).to(device)
-    return Surface(vertices[faces], normals[faces])
-
-
-def _smoothed(
-    host: SmoothsNormals, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N 3"]:
-    pairs = zip(position.split(NORMALS_AT_ONCE), normal.split(NORMALS_AT_ONCE), strict=True)
-    return torch.cat([host.smooth_normals(x, n) for x, n in pairs])
+    return Surface(triangles, corner_normals)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.export.mesh import surface_mesh
-from neilfpp_method.hosts.base import SmoothsNormals
+from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.shading.frame import safe_normalize
@@ -20,8 +21,6 @@ from neilfpp_method.train.run import Run
 
 __all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "meet_along"]
 
-POINTS_AT_ONCE = 2**14
-"""Number of points per call of the host's normal smoothing, which reads 32 neighbours of each."""
 STEP_BACK = 1e-4
 """Distance that a ray starts behind its point, scene units, so that it hits a surface through the point."""
 
@@ -48,22 +47,27 @@ class AssetSurface:
 
 
 @torch.no_grad()
-def fine_surface(run: Run, resolution: int) -> AssetSurface:
+def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda text: None) -> AssetSurface:
     """Return the surface that `export --what mesh` writes, with the normals that the run uses for shading.
 
+    Args:
+        run: a run with a mesh or a distance field.
+        resolution: resolution of `extracted_surface` for a distance field.
+        say: receives a message if a file in the run folder is replaced.
+
     Raises:
-        UserError: `surface_mesh` fails.
+        UserError: the field has no zero set.
     """
-    mesh, host = surface_mesh(run, resolution), run.model.host
-    faces, vertices = np.array(mesh.faces), np.array(mesh.vertices, dtype=np.float64)
+    host = run.model.host
     if isinstance(host, MeshHost):
+        mesh = surface_mesh(run)
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
-        return AssetSurface(vertices, faces, _shading_normals(host, position, normal).reshape(-1, 3, 3))
-    position, normal = (
-        torch.as_tensor(np.array(a), dtype=torch.float32, device=run.device)
-        for a in (vertices, mesh.vertex_normals)
-    )
-    return AssetSurface(vertices, faces, _shading_normals(host, position, normal)[faces])
+        normals = shading_normals(host, position, normal).double().cpu().numpy().reshape(-1, 3, 3)
+        return AssetSurface(np.array(mesh.vertices, np.float64), np.array(mesh.faces), normals)
+    surface = extracted_surface(run, resolution, shaded=True, say=say)
+    assert surface.normals is not None
+    faces = surface.faces.astype(np.int64)
+    return AssetSurface(surface.vertices.astype(np.float64), faces, surface.normals.astype(np.float64)[faces])
 
 
 def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> AssetSurface:
@@ -136,13 +140,3 @@ def meet_along(
         nearest[rows], valid[rows], hit_normal[rows] = distance, True, shaded[nearer]
         hit_position[rows] = start[rows] + hit.distance[nearer, None] * direction[rows]
     return NormalHits(valid.numpy(), nearest.numpy(), hit_position.numpy(), hit_normal.numpy())
-
-
-def _shading_normals(
-    host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
-) -> Float[np.ndarray, "N 3"]:
-    """Normals that the host uses for shading, smoothed if it smooths them."""
-    if isinstance(host, SmoothsNormals):
-        pairs = zip(position.split(POINTS_AT_ONCE), normal.split(POINTS_AT_ONCE), strict=True)
-        normal = torch.cat([host.smooth_normals(places, normals) for places, normals in pairs])
-    return normal.double().cpu().numpy()
