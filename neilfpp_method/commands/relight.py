@@ -69,7 +69,8 @@ class Relight:
     out: Path | None = None
     """Folder for the folders of the maps; default: RUN/relit."""
     resolution: int = 512
-    """Cells of the traced mesh along an edge of the scene's cube, if the run has no mesh of its own."""
+    """Cells of the traced mesh along an edge of the scene's cube, if the run has no mesh of its own; the mesh
+    is kept in RUN/cache for the next command."""
     force: bool = False
     """Render pictures again that exist already."""
     checkpoint: Checkpoint = "last"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
@@ -34,6 +35,25 @@ __all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalization", "Reader", "
 
 TEST_EVERY = 8
 """Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
+
+UNUSABLE = (
+    (
+        "transforms_*.json",
+        "no transforms_train.json",
+        "add the file of the training views, or name a file that lists all views transforms.json",
+    ),
+    (
+        "test_[0-9]*/metadata.json",
+        "no train_000/metadata.json",
+        "add the folders of the training views",
+    ),
+    (
+        "cams/*_cam.txt",
+        "cameras of MVSNet and BlendedMVS are not read",
+        "write them as transforms.json, or run neilfpp prepare on the folder of the images",
+    ),
+)
+"""Patterns of files with cameras that cannot be used, the reason, and the remedy."""
 
 FOUND: Mapping[SceneSource, str] = {
     "box": ", as stated by the capture",
@@ -204,12 +224,26 @@ def _recognize(root: Path) -> str:
             return name
     if (root / "config.json").is_file() and (root / "capture.json").is_file():
         raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
+    _check_cameras(root)
     photographs = _photographs(root)
     if photographs:
         remedy = f"run neilfpp prepare {root} --out CAPTURE, and train on CAPTURE"
         raise UserError(f"{root}: {photographs} photographs and no cameras", remedy)
     layouts = "; ".join(f"{name} ({reader.LAYOUT})" for name, reader in READERS.items())
     raise UserError(f"{root}: no capture in this folder", f"the formats are: {layouts}")
+
+
+def _check_cameras(root: Path) -> None:
+    """Raise a `UserError` if there are cameras, but none that can be used, or if they are in a sub-folder."""
+    for pattern, reason, remedy in UNUSABLE:
+        found = min(root.glob(pattern), default=None)
+        if found is not None:
+            raise UserError(f"{root}: there is {found.relative_to(root)}, but {reason}", remedy)
+    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+        # A folder that must not be read is none of the user's captures.
+        with suppress(OSError):
+            if any(reader.recognize(folder) for reader in READERS.values()):
+                raise UserError(f"{root}: the capture is in the sub-folder {folder.name}", f"give {folder}")
 
 
 def _photographs(root: Path) -> int:

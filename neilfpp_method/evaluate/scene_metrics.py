@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField
 from neilfpp_method.evaluate import metrics
-from neilfpp_method.export.mesh import extract_mesh
+from neilfpp_method.export.extract import extract_mesh
 from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.train.run import Run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -68,7 +69,7 @@ def run_export(request: ExportRequest, bar: Bar, console: Console) -> None:
     if "asset" in what:
         check_asset(run, request.asset)
     if "mesh" in what:
-        mesh = export_mesh(run, out / "mesh.ply", resolution)
+        mesh = export_mesh(run, out / "mesh.ply", resolution, partial(console.print, soft_wrap=True))
         size = f"{len(mesh.vertices)} vertices, {len(mesh.faces)} faces"
         console.print(f"{size}, written to {out / 'mesh.ply'}", soft_wrap=True)
     if "light" in what:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +13,7 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularizedHits
+from neilfpp_method.hosts.camera_places import check_cameras
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.facts import SceneFacts
@@ -82,6 +84,7 @@ class VolSdfHost(nn.Module):
         facts: the range and the initial value of R, and the background, which is not "auto" any more.
         points: oriented points on the surface, scene frame, for L_pcd.
         cameras: camera positions, scene frame; the space around them is empty (`volume.free_space`).
+            Checkpoints contain them, because fields have no meaning in another scene frame.
 
     Attributes:
         starts_from_shape: whether G has been fitted to a known shape (`train.start`); in checkpoints.
@@ -109,6 +112,7 @@ class VolSdfHost(nn.Module):
         self.density = LaplaceDensity(config.volume.beta_init)
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
+        self.cameras = cameras
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
@@ -207,12 +211,19 @@ class VolSdfHost(nn.Module):
         interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
         return self.empty_space.may_hit(self.sdf, rays, interval, self.surface_width())
 
-    def get_extra_state(self) -> dict[str, int | None]:
-        """The age of the distance grid and the kind of start, for checkpoints."""
-        return {"grid_age": self.grid_age, "starts_from_shape": self.starts_from_shape}
+    def get_extra_state(self) -> dict[str, Any]:
+        """The age of the distance grid, the kind of start, and the cameras, for checkpoints."""
+        own = {"grid_age": self.grid_age, "starts_from_shape": self.starts_from_shape}
+        return {**own, "cameras": self.cameras}
 
-    def set_extra_state(self, state: dict[str, int | None]) -> None:
-        """Restore what `get_extra_state` returned."""
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned, except the cameras, which must not have moved.
+
+        Raises:
+            UserError: see `check_cameras`.
+        """
+        # Checkpoints of earlier versions have no cameras.
+        check_cameras(state.get("cameras"), self.cameras)
         self.grid_age, self.starts_from_shape = state["grid_age"], state["starts_from_shape"]
 
     # ----------------------------------------------------------------------------------------------- geometry

@@ -7,6 +7,7 @@ Files:
     RUN/relit/<map>/<view>.json     settings of the image; written last, so it marks a finished image
     RUN/relit/<map>/turntable.mp4   with --views turntable
     RUN/relit/<map>/metrics.json    with --truth
+    RUN/cache/                      the extracted surface (`export.surface_cache`)
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def relight(
         The folder that contains the images.
 
     Raises:
-        UserError: an option is invalid, or the run lacks what it needs. In these cases nothing is written.
+        UserError: an option is invalid, or the run lacks what it needs. In these cases no image is written.
     """
     check_request(request)
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
@@ -86,7 +87,7 @@ def relight(
         name: [s for s in shots if request.force or not folder.has(s)] for name, folder in folders.items()
     }
     if any(missing.values()):
-        surface = surface_of_run(run, request.resolution)
+        surface = surface_of_run(run, request.resolution, say)
         if box and not box.may_meet(surface.triangles):
             raise UserError(
                 "--box contains no part of the surface", "give two corners in the world frame of the capture"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Callable
+
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.mesh import shading_normals, surface_mesh
+from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.train.run import Run
@@ -25,7 +27,9 @@ def check_material(run: Run) -> None:
 
 
 @torch.no_grad()
-def surface_of_run(run: Run, resolution: int) -> Surface:
+def surface_of_run(
+    run: Run, resolution: int, say: Callable[[str], None] = lambda text: None, keep: bool = True
+) -> Surface:
     """Return the mesh the run was given, or the one that `neilfpp export --what mesh` extracts.
 
     Shading normals are those of training: the host's normals, smoothed if the host smooths them.
@@ -33,19 +37,26 @@ def surface_of_run(run: Run, resolution: int) -> Surface:
     Args:
         run: the trained run.
         resolution: number of cells along an edge of the scene's cube when a mesh is extracted.
+        say: receives a message if a file in the run folder is replaced.
+        keep: whether an extracted mesh is kept in the run folder.
 
     Raises:
         UserError: the run has no surface.
     """
-    host, device = run.model.host, run.device
+    host = run.model.host
     if isinstance(host, MeshHost):
         triangles, normals = host.triangles.float(), host.corner_normals.float()
-        smooth = shading_normals(run, triangles.reshape(-1, 3), normals.reshape(-1, 3))
+        smooth = shading_normals(host, triangles.reshape(-1, 3), normals.reshape(-1, 3))
         return Surface(triangles, smooth.view_as(triangles))
-    mesh = surface_mesh(run, resolution)
-    vertices, normals = (
-        torch.from_numpy(np.asarray(part, dtype=np.float32)).to(device)
-        for part in (mesh.vertices, mesh.vertex_normals)
+    if not isinstance(host, HasSdf):
+        raise UserError(
+            f"{run.path}: the host of this run has no surface to trace",
+            "use a run of the VolSDF or mesh host",
+        )
+    surface = extracted_surface(run, resolution, shaded=True, say=say, keep=keep)
+    assert surface.normals is not None
+    faces = surface.faces
+    triangles, corner_normals = (
+        torch.from_numpy(values[faces]).to(run.device) for values in (surface.vertices, surface.normals)
     )
-    faces = torch.from_numpy(np.asarray(mesh.faces, dtype=np.int64)).to(device)
-    return Surface(vertices[faces], shading_normals(run, vertices, normals)[faces])
+    return Surface(triangles, corner_normals)

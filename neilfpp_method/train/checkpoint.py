@@ -81,10 +81,13 @@ def load_weights(module: nn.Module, weights: Mapping[str, Any], run: Path) -> No
     """Load weights of a checkpoint into a model or a light solver.
 
     Raises:
-        UserError: if they do not fit, because the settings of the run have been changed.
+        UserError: if they do not fit, because the settings, the capture or the mesh of the run have been
+            changed.
     """
     try:
         module.load_state_dict(weights)
+    except UserError as error:
+        raise UserError(f"{run}: {error.problem}", error.remedy) from error
     except (RuntimeError, TypeError) as error:
         raise UserError(
             f"{run}: the checkpoint does not fit the settings in config.json",

@@ -15,6 +15,7 @@
 - `effects.json`: the simulated effects and the reasons (docs/effects.md);
 - `light.json`: evidence for lamps at each fit of the light; missing if the settings decide;
 - `plan.json`: the plan of a run with `--budget`, and its revisions;
+- `cache/`: surfaces that commands have extracted (`export.surface_cache`); it can be deleted;
 - `skipped/`: steps that were not finite, for `neilfpp replay`; missing if there were none.
 """
 

@@ -63,7 +63,7 @@ def view(
     check_address(request.host, request.port)
     skies = _skies(request.env, request.env_layout)
     loaded = _checkpoint_time(request)
-    subject = None if request.follow and loaded is None else _load(request)
+    subject = None if request.follow and loaded is None else _load(request, say)
     # viser is optional, so it is imported only after check_viser.
     from neilfpp_method.view.browser import open_page
 
@@ -85,7 +85,7 @@ def view(
             written = _checkpoint_time(request) if request.follow else loaded
             if written != loaded:
                 loaded = written
-                page.show(_load(request))
+                page.show(_load(request, say))
     finally:
         page.stop()
 
@@ -107,9 +107,12 @@ def check_viser() -> None:
         )
 
 
-def _load(request: ViewRequest) -> Subject:
+def _load(request: ViewRequest, say: Callable[[str], None]) -> Subject:
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
-    return subject_of(run, request.resolution)
+    if request.follow:
+        # Every checkpoint has another surface, so none is worth keeping.
+        return subject_of(run, request.resolution, keep=False)
+    return subject_of(run, request.resolution, say)
 
 
 def _checkpoint_time(request: ViewRequest) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -83,16 +84,20 @@ class Lighting:
         return replace(self, lamps=lamps, own=False)
 
 
-def subject_of(run: Run, resolution: int) -> Subject:
+def subject_of(
+    run: Run, resolution: int, say: Callable[[str], None] = lambda text: None, keep: bool = True
+) -> Subject:
     """Prepare a run for viewing.
 
     Args:
         run: the run.
         resolution: number of cells along an edge of the scene's cube when a surface is extracted from a
             distance field.
+        say: receives a message if a file in the run folder is replaced.
+        keep: whether an extracted surface is kept in the run folder.
     """
     try:
-        surface, note = surface_of_run(run, resolution), ""
+        surface, note = surface_of_run(run, resolution, say, keep), ""
     except UserError as error:
         surface, note = None, f"Only R can be shown: {error.problem}; {error.remedy}."
     if surface is not None and not run.has_material:

@@ -109,6 +109,31 @@ def test_a_folder_of_photographs_has_to_be_prepared(tmp_path, capfd, folder):
     refused(capfd, ["train", "--data", photos], *words, leaves=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("found", "reason", "remedy"),
+    [
+        ("transforms_test.json", "no transforms_train.json", "add the file of the training views"),
+        ("test_000/metadata.json", "no train_000/metadata.json", "add the folders of the training views"),
+        ("cams/00000000_cam.txt", "cameras of MVSNet and BlendedMVS are not read", "transforms.json"),
+    ],
+)
+def test_cameras_that_cannot_be_used(tmp_path, capfd, found, reason, remedy):
+    """The images have cameras, so that there are none is not what is wrong."""
+    for name in (found, "test_000/rgba.png"):
+        (tmp_path / "lego" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "lego" / name).write_text("{}")
+    words = (f"{tmp_path / 'lego'}: there is {found}, but {reason}", remedy)
+    refused(capfd, ["inspect", tmp_path / "lego"], *words, leaves=tmp_path)
+    refused(capfd, ["train", "--data", tmp_path / "lego"], *words, leaves=tmp_path)
+
+
+def test_the_folder_above_a_capture(tmp_path, capfd, capture):
+    shutil.copytree(capture, tmp_path / "scenes" / "lego")
+    write_png(tmp_path / "scenes" / "001.png", np.zeros((4, 4, 3), np.uint8))
+    words = (f"{tmp_path / 'scenes'}: the capture is in the sub-folder lego", f"give {tmp_path}/scenes/lego")
+    refused(capfd, ["inspect", tmp_path / "scenes"], *words, leaves=tmp_path)
+
+
 def test_a_point_cloud_that_cannot_be_read(tmp_path, capfd, capture):
     root = tmp_path / "broken"
     shutil.copytree(capture, root)

@@ -58,6 +58,53 @@ def test_a_run_whose_capture_has_moved(tmp_path, capfd, trained, name):
         assert main(["export", str(run), "--device", "cpu", "--resolution", "16"]) == 0
 
 
+@pytest.mark.parametrize("name", ["eval", "render", "export", "relight"])
+def test_a_run_whose_scene_frame_has_been_edited(tmp_path, capfd, trained, name):
+    """The fields of a run have a meaning only in the frame in which they were trained."""
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    source = json.loads((run / "capture.json").read_text())
+    for change in ({"unit": 1.01 * source["unit"]}, {"center": [0.0, 0.0, 0.0]}):
+        (run / "capture.json").write_text(json.dumps({**source, **change}))
+        words = (run, "the training cameras are not where they were", "restore unit and center")
+        refused(capfd, [name, run, "--device", "cpu"], *words, leaves=tmp_path)
+
+
+def test_a_training_whose_scene_frame_has_been_edited(tmp_path, capfd, trained):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run)
+    before = checkpoint_path(run, "sdf_init").read_bytes()
+    last_checkpoint(run).write_bytes(before)
+    source = json.loads((run / "capture.json").read_text())
+    (run / "capture.json").write_text(json.dumps({**source, "unit": 2 * source["unit"]}))
+    assert main(["train", "--out", str(run), "--resume", "--device", "cpu"]) == 2
+    said = capfd.readouterr().err
+    assert said.count("error: ") == 1
+    assert "the training cameras are not where they were" in said
+    assert last_checkpoint(run).read_bytes() == before
+
+
+def test_a_run_whose_capture_has_other_cameras(tmp_path, capfd, trained, capture):
+    """Views may be added and removed, but those of the training must stay where they were."""
+    run, moved = tmp_path / "run", tmp_path / "moved"
+    shutil.copytree(trained, run)
+    shutil.copytree(capture, moved)
+    source = json.loads((run / "capture.json").read_text())
+    (run / "capture.json").write_text(json.dumps({**source, "root": str(moved)}))
+    scene = moved / "inputs" / "sfm_scene.json"
+    described = json.loads(scene.read_text())
+    cameras, files = described["camera_track_map"]["images"], described["image_path"]["file_paths"]
+    cameras.pop("1"), files.pop("1")
+    (moved / "inputs" / "images" / "001.exr").unlink()
+    scene.write_text(json.dumps(described))
+    command = ["export", run, "--resolution", "16", "--device", "cpu", "--out", tmp_path / "out"]
+    assert main([str(word) for word in command]) == 0
+    for camera in cameras.values():
+        camera["camera"]["extrinsic"][3] += 0.1
+    scene.write_text(json.dumps(described))
+    refused(capfd, command, run, "the training cameras are not where they were", leaves=tmp_path)
+
+
 @pytest.mark.parametrize("name", ["train", "eval", "render", "export"])
 def test_a_place_that_cannot_be_written(tmp_path, capfd, capture, trained, name):
     """A file stands where a folder would have to."""

@@ -13,7 +13,8 @@ from skimage.measure import marching_cubes
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.mesh import export_mesh, extract_mesh
+from neilfpp_method.export.extract import extract_mesh
+from neilfpp_method.export.mesh import export_mesh
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits

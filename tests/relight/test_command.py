@@ -15,6 +15,7 @@ import torch
 from neilfpp_method.cli import COMMANDS, main
 from neilfpp_method.commands.command import Command
 from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.export import surface_cache
 from neilfpp_method.relight import command
 from neilfpp_method.relight.lamplight import Lamplight
 from neilfpp_method.train.checkpoint import last_checkpoint
@@ -53,8 +54,13 @@ def relit(run: Path, *options: object) -> int:
     return main(["relight", str(run), *FEW, *map(str, options)])
 
 
+def files(run: Path) -> set[Path]:
+    """Everything in a run, without the surfaces that are kept for later commands."""
+    return {path for path in run.rglob("*") if "cache" not in path.relative_to(run).parts}
+
+
 def refused(capfd, run: Path, *options: object, words: tuple[str, ...]) -> None:
-    before = {path for path in run.rglob("*")}
+    before = files(run)
     capfd.readouterr()
     assert relit(run, *options) == 2
     said = capfd.readouterr().err
@@ -62,7 +68,7 @@ def refused(capfd, run: Path, *options: object, words: tuple[str, ...]) -> None:
     assert said.startswith("error: ")
     for word in words:
         assert word in said
-    assert {path for path in run.rglob("*")} == before
+    assert files(run) == before
 
 
 @pytest.mark.parametrize("which", ["found", "given"])
@@ -109,6 +115,27 @@ def test_the_own_light_includes_the_lamps(found):
     made = json.loads((found / "relit" / "own" / "000.json").read_text())
     assert made["lamps"]
     assert made["width"] == 12
+
+
+def test_the_surface_is_extracted_once_and_the_picture_is_the_same(found, tmp_path, monkeypatch):
+    shutil.rmtree(found / "cache", ignore_errors=True)
+    assert relit(found, "--scale", 0.5, "--out", tmp_path / "first") == 0
+    monkeypatch.setattr(surface_cache, "extract_mesh", lambda *_, **__: pytest.fail("extracted again"))
+    monkeypatch.setattr(surface_cache, "shading_normals", lambda *_: pytest.fail("normals computed again"))
+    assert relit(found, "--scale", 0.5, "--out", tmp_path / "second") == 0
+    first, second = (read_image(tmp_path / name / "own" / "000.exr") for name in ("first", "second"))
+    assert np.array_equal(first.pixels, second.pixels)
+    assert np.array_equal(first.alpha, second.alpha)
+
+
+def test_a_damaged_surface_is_extracted_again_with_a_line(found, tmp_path, capfd):
+    assert relit(found, "--scale", 0.5, "--out", tmp_path / "first") == 0
+    (found / "cache" / "surface-32.npz").write_bytes(b"PK")
+    capfd.readouterr()
+    assert relit(found, "--scale", 0.5, "--out", tmp_path / "second") == 0
+    said = capfd.readouterr()
+    assert said.err == ""
+    assert said.out.count("surface-32.npz: damaged (") == 1
 
 
 def test_existing_images_are_not_rendered_again(given, sky, tmp_path, capfd):

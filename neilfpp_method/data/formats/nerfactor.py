@@ -30,8 +30,8 @@ IMAGE = "rgba.png"
 
 
 def recognize(root: Path) -> bool:
-    """Whether the folder has the first training view."""
-    return (root / "train_000" / FILE).is_file()
+    """Whether the folder has a training view."""
+    return any(root.glob(f"train_[0-9]*/{FILE}"))
 
 
 def read(root: Path) -> CaptureFiles:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -47,7 +48,7 @@ class AssetOptions:
     """Options of an asset.
 
     Attributes:
-        resolution: resolution of the fine surface (`extract_mesh`).
+        resolution: resolution of the fine surface (`extracted_surface`).
         texture_size: width and height of the textures, texels.
         faces: largest number of triangles.
         error: largest distance, scene units, that simplification below `faces` may cause.
@@ -108,7 +109,7 @@ def export_asset(
         UserError: there is no surface, no camera sees it, the charts do not fit on the texture, or the folder
             cannot be written.
     """
-    full = fine_surface(run, options.resolution)
+    full = fine_surface(run, options.resolution, partial(console.print, soft_wrap=True))
     cameras = [run.capture.scene_camera(view) for view in run.capture.train_views]
     fine = clean(full, visible_faces(full, cameras))
     console.print(f"surface: kept {len(fine.faces)} of {len(full.faces)} triangles, which cameras see")

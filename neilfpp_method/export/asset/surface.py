@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.export.mesh import shading_normals, surface_mesh
+from neilfpp_method.export.mesh import surface_mesh
+from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
 from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
 from neilfpp_method.shading.frame import safe_normalize
@@ -45,23 +47,27 @@ class AssetSurface:
 
 
 @torch.no_grad()
-def fine_surface(run: Run, resolution: int) -> AssetSurface:
+def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda text: None) -> AssetSurface:
     """Return the surface that `export --what mesh` writes, with the normals that the run uses for shading.
 
+    Args:
+        run: a run with a mesh or a distance field.
+        resolution: resolution of `extracted_surface` for a distance field.
+        say: receives a message if a file in the run folder is replaced.
+
     Raises:
-        UserError: `surface_mesh` fails.
+        UserError: the field has no zero set.
     """
-    mesh, host = surface_mesh(run, resolution), run.model.host
-    faces, vertices = np.array(mesh.faces), np.array(mesh.vertices, dtype=np.float64)
+    host = run.model.host
     if isinstance(host, MeshHost):
-        corner, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
-        normals = shading_normals(run, corner, normal).double().cpu().numpy()
-        return AssetSurface(vertices, faces, normals.reshape(-1, 3, 3))
-    position, normal = (
-        torch.as_tensor(np.array(a), dtype=torch.float32, device=run.device)
-        for a in (vertices, mesh.vertex_normals)
-    )
-    return AssetSurface(vertices, faces, shading_normals(run, position, normal).double().cpu().numpy()[faces])
+        mesh = surface_mesh(run)
+        position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
+        normals = shading_normals(host, position, normal).double().cpu().numpy().reshape(-1, 3, 3)
+        return AssetSurface(np.array(mesh.vertices, np.float64), np.array(mesh.faces), normals)
+    surface = extracted_surface(run, resolution, shaded=True, say=say)
+    assert surface.normals is not None
+    faces = surface.faces.astype(np.int64)
+    return AssetSurface(surface.vertices.astype(np.float64), faces, surface.normals.astype(np.float64)[faces])
 
 
 def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> AssetSurface:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,11 @@ def test_bad_metadata_is_refused(tmp_path: Path, entry: str, value: object, comp
     path = scene(tmp_path) / "test_001" / "metadata.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {entry: value}))
     refused(tmp_path, str(path), complaint)
+
+
+def test_the_first_training_view_may_be_missing(tmp_path: Path) -> None:
+    shutil.rmtree(scene(tmp_path) / "train_000")
+    assert [view.name for view in load_capture(tmp_path).train_views] == FOLDERS[1:3]
 
 
 def test_missing_files_are_refused(tmp_path: Path) -> None:

@@ -29,6 +29,8 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import has_normals, read_oriented_ply, read_positions
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import Normalization
+from neilfpp_method.errors import UserError
+from neilfpp_method.export.surface_cache import ExtractedSurface, read_surface, write_surface
 from neilfpp_method.settings.files import read_settings
 from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import preset
@@ -38,7 +40,7 @@ from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.light_record import read_fits
 from neilfpp_method.train.run import read_description
 from neilfpp_method.train.work_record import read_work
-from tests.data.formats import test_blender, test_colmap, test_dtu, test_nero, test_transforms
+from tests.data.formats import test_blender, test_colmap, test_dtu, test_nerfactor, test_nero, test_transforms
 from tests.data.make_capture import make_capture
 from tests.data.test_capture_folder import folder as own_capture
 
@@ -417,6 +419,24 @@ def _read_run(folder: Path, damaged: Path) -> None:
     read_work(folder)
 
 
+def _surface(folder: Path) -> list[Path]:
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    vertices, faces = ball.vertices.astype(np.float32), ball.faces.astype(np.int32)
+    for name, normals in (("plain", None), ("shaded", vertices)):
+        write_surface(folder / f"{name}.npz", ExtractedSurface(vertices, faces, normals), "weights")
+    return sorted(folder.iterdir())
+
+
+def _read_surface(folder: Path, damaged: Path) -> None:
+    said: list[str] = []
+    surface = read_surface(damaged, "weights", said.append)
+    if surface is None:
+        raise UserError(*said, "extract it again")
+    assert np.isfinite(surface.vertices).all()
+    assert surface.faces.min() >= 0
+    assert surface.faces.max() < len(surface.vertices)
+
+
 READERS: Mapping[str, Reader] = {
     "EXR": Reader(_exr, _read_image),
     "PNG": Reader(_png, _read_image),
@@ -436,6 +456,11 @@ READERS: Mapping[str, Reader] = {
     "transforms_train.json": Reader(
         _json_capture(test_blender.scene, "transforms_train.json", "transforms_test.json"), _read_capture, 0.2
     ),
+    "metadata.json (NeRFactor)": Reader(
+        _json_capture(test_nerfactor.scene, *(f"{name}/metadata.json" for name in ("train_000", "test_000"))),
+        _read_capture,
+        0.2,
+    ),
     "COLMAP, binary": Reader(_colmap(text=False), _read_capture, 0.2),
     "COLMAP, text": Reader(_colmap(text=True), _read_capture, 0.2),
     "NPZ of cameras (DTU)": Reader(_json_capture(test_dtu.scan, "cameras_sphere.npz"), _read_capture, 0.2),
@@ -445,4 +470,5 @@ READERS: Mapping[str, Reader] = {
     "settings (YAML, JSON)": Reader(_yaml, _read_yaml),
     "checkpoint": Reader(_checkpoint, _read_checkpoint),
     "run folder (JSON)": Reader(_run, _read_run),
+    "surface in a run folder (NPZ)": Reader(_surface, _read_surface),
 }
