@@ -267,7 +267,7 @@ def test_a_borrowed_host_starts_with_the_material_or_logs_its_step(caplog):
     first, second = (record.message for record in caplog.records)
     assert now.model.config.train.sdf_steps == 0
     assert (
-        "Ball: the material is trained from step 0; the host gets gradients from step 1500; "
+        "Ball: the material is trained from step 0; the host gets gradients from step 3000; "
         "a proxy of its surface" in first
     )
     assert "nothing is computed before step 4 (train.sdf_steps)" in second

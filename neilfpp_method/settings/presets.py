@@ -153,14 +153,14 @@ FAST: Mapping[str, Any] = {
     # In the short joint stage geometry keeps the learning rate with which SDF init ended.
     "optimizer.geometry": 2e-2,
     "optimizer.radiance": 5e-3,
-    "optimizer.brdf": 5e-3,
+    "optimizer.brdf": 1e-2,
     "optimizer.light": 3e-2,
     "optimizer.beta": 1e-3,
     "optimizer.exposure": EXPOSURE_RATE,
     "optimizer.joint": 0.1,
     "optimizer.background_from": 0.5,
     "train.sdf_steps": 2_000,
-    "train.material_steps": 1_500,
+    "train.material_steps": 3_000,
     "train.joint_steps": 300,
     "train.rays": 512,
     "train.fresh": 0.25,
@@ -187,7 +187,7 @@ BALANCED: Mapping[str, Any] = {
     "light.fit.points": 2048,
     "light.fit.every": 250,
     "train.sdf_steps": 4_000,
-    "train.material_steps": 3_000,
+    "train.material_steps": 6_000,
     "train.joint_steps": 400,
     "train.rays": 1024,
 }
@@ -214,7 +214,7 @@ BEST: Mapping[str, Any] = {
     "shading.train_samples": 128,
     "light.fit.every": 500,
     "train.sdf_steps": 10_000,
-    "train.material_steps": 8_000,
+    "train.material_steps": 12_000,
     "train.joint_steps": 2_000,
     "train.rays": 2048,
 }
@@ -270,7 +270,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     """Adapt a preset to geometry that is given as a mesh.
 
     - Stages: R is trained first for a few steps, because light between surfaces influences the choice of the
-      light; then R, B and L are trained together, in twice as many steps, because R is new as well.
+      light; then R, B and L are trained together, in the steps of both other stages.
     - R gets no feature of G, so it encodes positions itself; 8×128 is the paper's surface light field.
     - The normals are given: they are not smoothed, and R need not support their recovery.
     - Rays through a mesh are cheap, so the light is solved for more often.
@@ -283,7 +283,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         "volume.normal_radius": 0.0,
         "loss.lambertian": 10.0 * config.loss.lambertian,
         "train.sdf_steps": train.sdf_steps // 10,
-        "train.material_steps": 2 * (train.material_steps + train.joint_steps),
+        "train.material_steps": train.material_steps + train.joint_steps,
         "train.joint_steps": 0,
     }
     if config.light.kind != "free":
