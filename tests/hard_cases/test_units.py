@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,8 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import read_oriented_ply, write_oriented_ply
+from neilfpp_method.lighting import solver
+from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.training import Training
@@ -26,6 +29,8 @@ from tests.train.small_runs import small_config, small_training, solved_light
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
 STEPS = 4
+FIT_STEPS = 5
+"""Steps of a light fit. More of them amplify the rounding of the shifted logarithms."""
 
 
 def settings(light: str) -> NeilfConfig:
@@ -53,7 +58,9 @@ def trained(folder: Path, light: str, radiance: float = 1.0, length: float = 1.0
         points = read_oriented_ply(cloud)
         write_oriented_ply(cloud, dataclasses.replace(points, position=points.position * length))
     run = small_training(root, folder / "run", settings(light))
-    train(run)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver, "Objective", partial(Objective, steps=FIT_STEPS))
+        train(run)
     assert run.skipped == 0
     run.model.eval()
     return run
@@ -81,9 +88,8 @@ def test_other_units_give_the_same_scene(tmp_path, usual, radiance, length):
     with torch.no_grad():
         for shown in (lambda model: model.light.radiance(x, wi), lambda model: model.host.render(rays).color):
             expected = radiance * shown(reference.model)
-            # The steps of the light fits amplify the rounding of the shifted logarithms.
             torch.testing.assert_close(
-                shown(other.model), expected, rtol=1e-2, atol=1e-4 * float(expected.mean())
+                shown(other.model), expected, rtol=1e-3, atol=1e-4 * float(expected.mean())
             )
 
 
