@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -67,7 +68,7 @@ class OriginsOfNotFinite(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self._origins: dict[int, Origin] = {}
+        self._origins: dict[StorageWeakRef, Origin] = {}
         self._count = 0
 
     def origin_of(self, value: Tensor) -> Origin | None:
@@ -106,9 +107,13 @@ def _tensors(nest: Any) -> Iterator[Tensor]:
     return (leaf for leaf in tree_leaves(nest) if isinstance(leaf, Tensor))
 
 
-def _memory(value: Tensor) -> int:
-    """Key of a tensor: its memory, which views and the results of in-place operations share."""
-    return value.untyped_storage().data_ptr()
+def _memory(value: Tensor) -> StorageWeakRef:
+    """Key of a tensor: its storage, which views and the results of in-place operations share.
+
+    An address would not do. It is used again when a tensor is gone, and a compiled loop may write a NaN there
+    that does not come from the tensor before.
+    """
+    return StorageWeakRef(value.untyped_storage())
 
 
 def _origin(order: int, func: Any, value: Tensor) -> Origin:

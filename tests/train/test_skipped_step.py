@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -140,6 +141,18 @@ def test_an_infinity_that_a_mask_removes_is_not_reported():
     assert origins.origin_of(harmless) is None
     assert "log" in origins.origin_of(wrong).operation
     assert origins.origin_of(wrong).rows == (0,)
+
+
+def test_memory_that_is_used_again_has_no_origin():
+    """Freed memory is given to the next tensor, and a compiled loop may write a NaN there."""
+    memory = np.zeros(4, dtype=np.float32)
+    with OriginsOfNotFinite() as origins:
+        gone = torch.from_numpy(memory).log_()
+        assert "log" in origins.origin_of(gone).operation
+        del gone
+        memory[:] = (0.0, math.nan, 0.0, 0.0)
+        wrong = torch.from_numpy(memory) * 2.0
+    assert origins.origin_of(wrong) is None
 
 
 def test_a_step_that_is_not_stored(training, monkeypatch, capfd):
