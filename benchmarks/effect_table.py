@@ -31,6 +31,7 @@ JUDGED = (
     "environment-map",
     "coloured-light",
     "reflection",
+    "long-tails",
     "metals",
     "varying-roughness",
     "lobe-sampling",
@@ -44,7 +45,7 @@ TRUE_EFFECTS: Mapping[str, set[str]] = {
     "polished": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "tabletop_env": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "tabletop_mix": {"inter-reflection", "lamps", "metals", *SKY, *GLOSSY},
-    "spot_city": {"inter-reflection", "metals", *SKY, *GLOSSY},
+    "spot_city": {"inter-reflection", "long-tails", "metals", *SKY, *GLOSSY},
     "spot_paint": {"inter-reflection", *SKY, *GLOSSY},
 }
 """The effects that each capture has, by the name of its folder: those of `effect_scenes`, and four others."""

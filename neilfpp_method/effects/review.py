@@ -148,7 +148,8 @@ def _review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) -
     if model.lobe is not None:
         data = PlaceData(places, place_transport(places, model.lobe, model.scene), typical)
         if plan.is_open("metals") and model.brdf.metals:
-            decisions.append(plan.decide("metals", metals_evidence(data), step))
+            measured = metals_evidence(data, model.facts.response)
+            decisions.append(plan.decide("metals", measured, step))
             model.use(plan.config)
         first = find_first_light(data, model.brdf.metals)
     return LightReview(decisions, first)

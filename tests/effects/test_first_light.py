@@ -72,13 +72,15 @@ def test_held_back_views_identify_the_lobe_of_the_images():
 def test_held_back_views_distinguish_metals_from_paint():
     lobe = LOBES["ggx"]
 
-    def gain(places: Places) -> Measurement:
-        return metals_evidence(data_of(places, lobe))
+    def gain(places: Places, response: str = "linear") -> Measurement:
+        return metals_evidence(data_of(places, lobe), response)
 
     mixed = gain(patched("ggx"))
     assert mixed.favours(chosen=True)
     assert mixed.value > 2 * mixed.deviation
     assert mixed.samples == COUNT
+    photographed = gain(patched("ggx"), "srgb")
+    assert photographed.threshold > mixed.threshold
     torch.manual_seed(1)
     color, roughness = 0.2 + 0.6 * torch.rand(COUNT, 3), torch.full((COUNT, 1), 0.36)
     paint = gain(ball(color, roughness, torch.zeros(COUNT, 1), lobe, VIEWS))
