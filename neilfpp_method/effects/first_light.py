@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.lamps import LampTrial
+from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals
 from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
@@ -41,8 +42,6 @@ MIN_PLACES = 100
 """Minimum number of places for an initial light."""
 FOLDS = 5
 """One in this many views is held back."""
-SCALES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)
-"""Geometric means of the base colour that are tried, from about that of charcoal to about that of snow."""
 FIRST_SCALE = 0.33
 """The scale that is fitted first, from an even light; every other fit starts from that of the nearest scale.
 """
@@ -76,7 +75,7 @@ class FirstLight:
         log_radiance: logarithm of the radiance of the map.
         mean: mean material of the places, N = 1; for base colour the geometric mean.
         errors: relative error in the held-back views for each mean base colour that was tried.
-        scale: the mean base colour with the lowest error.
+        scale: the chosen mean base colour (`light_scale`).
         places: number of places.
         observed: at most `LAMP_PIXELS` pixels of the places, for the search for lamps.
         material: material of these pixels, with the same base colour everywhere. In the fit the base colour
@@ -120,8 +119,9 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
     for scale in (*(s for s in SCALES if s > FIRST_SCALE), *(s for s in reversed(SCALES) if s < FIRST_SCALE)):
         start = _rescaled(fits, scale)
         fits[scale] = fit_places(split.known, Permitted(metals, scale), start, CARRIED_ROUNDS)
-    errors = {scale: place_errors(fit, split.held_back).mean().item() for scale, fit in fits.items()}
-    scale = _lowest(errors)
+    errors = {scale: place_errors(fit, split.held_back) for scale, fit in fits.items()}
+    mean_errors = {scale: error.mean().item() for scale, error in errors.items()}
+    scale = scale_of_metals(fits, errors, split.held_back.places) or lowest_scale(mean_errors)
     start = _rescaled(fits, scale)
 
     def fit_on(changed: PlaceData) -> PlaceFit:
@@ -139,7 +139,7 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
     return FirstLight(
         log_radiance=best.log_radiance,
         mean=mean,
-        errors=errors,
+        errors=mean_errors,
         scale=scale,
         places=places.shown_count,
         observed=places.observed[drawn],
@@ -187,21 +187,3 @@ def _rescaled(fits: Mapping[float, PlaceFit], scale: float) -> PlaceFit:
     fit, factor = fits[nearest], scale / nearest
     base_color = (fit.base_color * factor).clamp_max(1.0)
     return PlaceFit(fit.log_radiance - math.log(factor), base_color, fit.roughness, fit.metallic)
-
-
-def _lowest(errors: Mapping[float, float]) -> float:
-    """The scale of the lowest error.
-
-    At an end of the range it is the scale that was tried; within the range it is the minimum of the parabola
-    through the lowest error and its two neighbours, over the logarithm of the scale.
-    """
-    scales = sorted(errors)
-    number = min(range(len(scales)), key=lambda n: errors[scales[n]])
-    if number in (0, len(scales) - 1):
-        return scales[number]
-    left, middle, right = (math.log(scales[n]) for n in (number - 1, number, number + 1))
-    rise_left = (errors[scales[number]] - errors[scales[number - 1]]) / (middle - left)
-    rise_right = (errors[scales[number + 1]] - errors[scales[number]]) / (right - middle)
-    bend = (rise_right - rise_left) / ((right - left) / 2)
-    slope = (rise_left * (right - middle) + rise_right * (middle - left)) / (right - left)
-    return math.exp(min(max(middle - slope / bend, left), right)) if bend > 0 else scales[number]

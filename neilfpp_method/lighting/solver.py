@@ -11,6 +11,7 @@ The free light field is learned by gradient descent instead; its solver, `Nothin
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -79,7 +80,8 @@ class LightSolver(Protocol):
         """Look for lamps in addition to an initial map that has been set; if none is found, keep that map.
 
         The first `solve` is then due one interval of fits later, so that surfaces first learn under this
-        light.
+        light. If lamps are rejected here, later fits do not look for them, which halves their time: their
+        points are fewer, and surfaces that have learned with a light confirm it.
 
         Args:
             observed: surface points.
@@ -153,6 +155,8 @@ class MapSolver(nn.Module):
         self.light, self.lobe = light, lobe
         # Infinite before an initial light: the current base colour then determines the scale.
         self.register_buffer("log_mean_base_color", torch.tensor(torch.inf))
+        # Whether the initial light, which many more pixels support than a later fit, is better without lamps.
+        self.register_buffer("lamps_rejected", torch.tensor(False))
         self.memory = SurfaceMemory(config.fit.points, config.fit.every)
         # The light is only visible behind the scene if the background is open, and a known map needs no
         # observation.
@@ -206,6 +210,7 @@ class MapSolver(nn.Module):
                 measured = in_views
         if lamps.count:
             environment.resample(trial.light.log_radiance)
+        self.lamps_rejected.fill_(not lamps.count)
         return measured
 
     def use(self, config: MapLightConfig, lobe: Lobe | None) -> None:
@@ -245,8 +250,10 @@ class MapSolver(nn.Module):
             # If cameras saw the light directly, their pixels fix the scale.
             log_scale=self._log_scale(material) if sky is None else 0.0,
         )
-        points = FitPoints(observed, material, self.lobe, scene)
-        measured = solve_light(light, points, objective, self.config, first, lamps_if_undecided=at_start)
+        points, config = FitPoints(observed, material, self.lobe, scene), self.config
+        if self.lamps_rejected and config.kind == "auto":
+            config = dataclasses.replace(config, kind="distant")
+        measured = solve_light(light, points, objective, config, first, lamps_if_undecided=at_start)
         if environment.even:
             environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())
         return measured

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, _lowest, find_first_light, start_with
+from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light, start_with
 from neilfpp_method.effects.lamps import LampTrial
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.measurement import Measurement
@@ -91,15 +91,6 @@ def test_too_few_places_give_no_initial_light():
     places = patched("ggx")
     few = places.where(torch.nonzero(places.place < MIN_PLACES - 1)[:, 0])
     assert find_first_light(data_of(few, LOBES["ggx"]), metals=True) is None
-
-
-def test_lowest_is_the_minimum_of_the_parabola_over_the_logarithm():
-    def errors(foot: float) -> dict[float, float]:
-        return {s: math.log(s / foot) ** 2 for s in (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)}
-
-    assert _lowest(errors(0.27)) == pytest.approx(0.27)
-    assert _lowest(errors(0.05)) == 0.1  # at an end: no further
-    assert _lowest(errors(0.9)) == 0.7
 
 
 def test_an_untrained_field_starts_at_the_estimated_material():

@@ -13,6 +13,7 @@ from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import record_lamps
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.lighting import solver as solver_module
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.lamp_transport import from_lamps
 from neilfpp_method.lighting.map_transport import from_texels
@@ -94,3 +95,27 @@ def test_the_solver_starts_with_lamps_that_held_back_views_do_not_contradict(gai
     decision = record_lamps(plan, evidence, model.lamps.count, step=0)[0]
     assert decision.on is kept
     assert ("in held-back views" in decision.reason) is not kept
+
+
+@pytest.mark.parametrize("gain", [0.02, -0.02])
+def test_later_fits_do_not_look_for_lamps_that_the_start_rejected(gain, monkeypatch):
+    kinds = []
+
+    def solve_light(light, points, objective, config, *arguments, **options):
+        kinds.append(config.kind)
+        return honest(light, points, objective, config, *arguments, **options)
+
+    honest = solver_module.solve_light
+    monkeypatch.setattr(solver_module, "solve_light", solve_light)
+    observed, material = table_top()
+    model = sphere_model(preset("fast"))
+    torch.manual_seed(0)
+    solver = model.light_solver()
+    solver.start(observed, material, None, lambda *_: Evidence(gain, 0.01, 100, in_views=True))
+    restored = model.light_solver()
+    restored.load_state_dict(solver.state_dict())
+    for later in (solver, restored):
+        later.memory.remember(observed)
+        monkeypatch.setattr(type(later.memory), "due", True)
+        later.solve(model.brdf, None)
+    assert kinds == ["auto"] + 2 * ["auto" if gain > 0 else "distant"]

@@ -1,0 +1,80 @@
+"""Choose the scale between light and base colour.
+
+Twice the light on surfaces half as bright looks nearly the same. Only the reflection of dielectrics, which
+does not depend on base colour, reveals the scale. So light and materials are fitted for several mean base
+colours, and held-back views select one of them.
+
+Metals have no such reflection: if most places are metal, a wide range of scales explains the held-back views
+equally well. The reflectance of real metals selects the scale within this range. Clean metals reflect between
+half and nearly all of the light (Akenine-Möller et al., Real-Time Rendering, 4th edition, table 9.2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from jaxtyping import Float
+from torch import Tensor
+
+from neilfpp_method.effects.measurement import mean_of
+from neilfpp_method.effects.place_fit import PlaceFit
+from neilfpp_method.effects.places import Places
+
+__all__ = ["SCALES", "lowest_scale", "scale_of_metals"]
+
+SCALES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)
+"""Geometric means of the base colour that are tried, from about that of charcoal to about that of snow."""
+METAL_REFLECTANCE = 0.7
+"""Typical base colour of a metal, mean of the channels: iron has 0.57, gold 0.71, silver 0.95."""
+MIN_METAL_SHARE = 0.5
+"""Minimum share of places that are metal for a scale by the reflectance of metals. If there are fewer, the
+reflection of the dielectrics reveals the scale.
+"""
+
+
+def lowest_scale(errors: Mapping[float, float]) -> float:
+    """The scale of the lowest error in held-back views.
+
+    At an end of the range it is the scale that was tried; within the range it is the minimum of the parabola
+    through the lowest error and its two neighbours, over the logarithm of the scale.
+    """
+    scales = sorted(errors)
+    number = min(range(len(scales)), key=lambda n: errors[scales[n]])
+    if number in (0, len(scales) - 1):
+        return scales[number]
+    left, middle, right = (math.log(scales[n]) for n in (number - 1, number, number + 1))
+    rise_left = (errors[scales[number]] - errors[scales[number - 1]]) / (middle - left)
+    rise_right = (errors[scales[number + 1]] - errors[scales[number]]) / (right - middle)
+    bend = (rise_right - rise_left) / ((right - left) / 2)
+    slope = (rise_left * (right - middle) + rise_right * (middle - left)) / (right - left)
+    return math.exp(min(max(middle - slope / bend, left), right)) if bend > 0 else scales[number]
+
+
+def scale_of_metals(
+    fits: Mapping[float, PlaceFit], errors: Mapping[float, Float[Tensor, " N"]], held_back: Places
+) -> float | None:
+    """The scale at which metals have the reflectance of real metals, if the images permit it.
+
+    Args:
+        fits: light and materials for each scale.
+        errors: the error of each fit at the pixels of the held-back views.
+        held_back: these pixels.
+
+    Returns:
+        The scale closest to that of real metals whose error is not significantly above the lowest; None if
+        fewer than `MIN_METAL_SHARE` of the places are metal.
+    """
+    best = min(errors, key=lambda scale: errors[scale].mean().item())
+    shown = held_back.place.unique()
+    material = fits[best].material(shown)
+    is_metal = material.metallic[:, 0] > 0.5
+    if is_metal.float().mean() < MIN_METAL_SHARE:
+        return None
+    wanted = best * METAL_REFLECTANCE / material.base_color[is_metal].mean(-1).median().item()
+    equal = []
+    for scale, error in errors.items():
+        excess = mean_of(held_back.mean(error - errors[best])[shown], "excess of the error", 0.0)
+        if excess.value <= 2 * excess.deviation:
+            equal.append(scale)
+    return min(max(wanted, min(equal)), max(equal))

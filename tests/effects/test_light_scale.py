@@ -1,0 +1,60 @@
+"""The scale between light and base colour: the lowest error, or the reflectance of metals."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals
+from neilfpp_method.effects.material_grid import METALLICS
+from neilfpp_method.effects.place_data import ROWS
+from neilfpp_method.effects.place_fit import PlaceFit
+from neilfpp_method.effects.places import Places
+from neilfpp_method.structures import Observed
+
+COUNT, VIEWS = 40, 3
+
+
+def test_lowest_is_the_minimum_of_the_parabola_over_the_logarithm():
+    def errors(foot: float) -> dict[float, float]:
+        return {s: math.log(s / foot) ** 2 for s in SCALES}
+
+    assert lowest_scale(errors(0.27)) == pytest.approx(0.27)
+    assert lowest_scale(errors(0.05)) == 0.1  # at an end: no further
+    assert lowest_scale(errors(0.9)) == 0.7
+
+
+def fitted(scale: float, metal_share: float) -> PlaceFit:
+    """Places with one base colour, of which some are metal."""
+    metallic = torch.zeros(COUNT, dtype=torch.long)
+    metallic[: round(metal_share * COUNT)] = len(METALLICS) - 1
+    return PlaceFit(
+        torch.zeros(3, ROWS, 2 * ROWS), torch.full((COUNT, 3), scale), torch.zeros_like(metallic), metallic
+    )
+
+
+def chosen(excess: dict[float, float], metal_share: float) -> float | None:
+    """The scale for given mean errors above the lowest, with noise of 0.01 per place."""
+    generator = torch.Generator().manual_seed(0)
+    place = torch.arange(COUNT).repeat_interleave(VIEWS)
+    blank = torch.zeros(len(place), 3)
+    held_back = Places(COUNT, place, place % VIEWS, Observed(blank, blank, blank, blank))
+    noise = {s: 0.01 * torch.randn(COUNT, generator=generator) for s in excess}
+    errors = {s: 0.2 + value + (noise[s] - noise[s].mean())[place] for s, value in excess.items()}
+    return scale_of_metals({s: fitted(s, metal_share) for s in excess}, errors, held_back)
+
+
+def test_metals_have_the_reflectance_of_real_metals_where_the_images_do_not_tell():
+    flat = {0.22: 0.001, 0.33: 0.0, 0.5: 0.001, 0.7: 0.001}
+    assert chosen(flat, 0.8) == pytest.approx(0.7)
+
+
+def test_held_back_views_bound_the_scale_of_metals():
+    assert chosen({0.22: 0.001, 0.33: 0.0, 0.5: 0.001, 0.7: 0.05}, 0.8) == 0.5
+    assert chosen({0.22: 0.05, 0.33: 0.0, 0.5: 0.05, 0.7: 0.1}, 0.8) == 0.33
+
+
+def test_few_metals_do_not_determine_the_scale():
+    assert chosen({0.22: 0.001, 0.33: 0.0, 0.5: 0.001}, 0.4) is None
