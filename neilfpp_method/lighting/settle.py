@@ -105,8 +105,9 @@ def settle_lamps(
         if without.loss < best.loss:
             best = without
     for number in range(len(best.lamps.intensity)):
-        pair = best, settle(_of_other_kind(best.lamps, number, position))
-        panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
+        other = settle(_of_other_kind(best.lamps, number, position))
+        is_panel = best.lamps.places.axis[number].any()
+        panel, bulb = (best, other) if is_panel else (other, best)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
     return settle(best.lamps).lamps
 

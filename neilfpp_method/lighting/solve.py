@@ -88,7 +88,7 @@ def solve_light(
         found = start.fit(target, objective)
     unknown.copy_(found.log_radiance)
     reach = from_candidates.sources[0].mean(0)
-    merged = merge_lamps(places, found.intensity, reach, most=len(lamps.position))
+    merged = merge_lamps(places, found.intensity, reach, max_lamps=len(lamps.position))
     _settle(lamps, merged, map_only, points, objective)
     return measured
 
@@ -125,12 +125,12 @@ def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) 
 
 @dataclass(frozen=True)
 class _Compared:
-    """Two fits to all points but the last fold held back, and the evidence of all folds held back.
+    """Fits of the light without and with lamps, and their comparison.
 
     Attributes:
-        without_lamps: the last fit without lamps.
-        with_lamps: the last fit with lamps.
-        evidence: the comparison of the two at held-back points.
+        without_lamps: the fit without lamps while the last fold was held back.
+        with_lamps: the fit with lamps while the last fold was held back.
+        evidence: the comparison at the points of all folds that were held back.
     """
 
     without_lamps: MapAndLamps
@@ -141,20 +141,25 @@ class _Compared:
 def _compare_at_held_back_points(
     map_only: CarriedLight, with_lamps: CarriedLight, target: Target, objective: Objective, folds: int
 ) -> _Compared:
-    """Fit the light with and without lamps, with so many of the `FOLDS` folds held back in turn.
+    """Fit the light without and with lamps while each of the first `folds` folds is held back in turn.
 
-    Surfaces learn under the light that is chosen first and then confirm it, so the first decision uses all
-    folds.
+    The first decision uses all folds, because later ones are biased towards it: the base colour is learned
+    under the light that was chosen first, and then supports that light.
     """
     fold = _folds(target.position)
     gains = []
     for number in range(folds):
         held_back, fitted = fold == number, fold != number
-        plain = map_only[fitted].fit(target[fitted], objective)
-        found = with_lamps[fitted].fit(target[fitted], objective)
-        lights = (map_only[held_back].with_light(plain), with_lamps[held_back].with_light(found))
-        gains.append(error_reduction(*lights, target[held_back], objective))
-    return _Compared(plain, found, evidence(torch.cat(gains)))
+        without = map_only[fitted].fit(target[fitted], objective)
+        having = with_lamps[fitted].fit(target[fitted], objective)
+        gain = error_reduction(
+            map_only[held_back].with_light(without),
+            with_lamps[held_back].with_light(having),
+            target[held_back],
+            objective,
+        )
+        gains.append(gain)
+    return _Compared(without, having, evidence(torch.cat(gains)))
 
 
 def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
