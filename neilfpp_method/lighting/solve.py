@@ -66,14 +66,14 @@ def solve_light(
     """
     lamps, target = light.lamps, points.target
     map_only = _map_only(light.light, points, is_known=config.map is not None)
-    unknown, no_lamps = map_only.light.log_radiance, map_only.light.intensity
+    unknown = map_only.light.log_radiance
     if config.kind == "distant":
         unknown.copy_(map_only.fit(target, objective).log_radiance)
         return None
 
     places = propose(lamps, points.observed.position, CANDIDATES)
     from_candidates = points.from_lamps(places, lamps.radius)
-    intensity = no_lamps.new_zeros(len(places.position), 3)
+    intensity = unknown.new_zeros(len(places.position), 3)
     intensity[: lamps.count] = lamps.lit_intensity
     start = CarriedLight(MapAndLamps(unknown, intensity), map_only.transport.concatenate(from_candidates))
     measured = None
@@ -82,7 +82,7 @@ def solve_light(
         found, measured = compared.with_lamps, compared.evidence
         if not measured.favours(chosen=lamps_if_undecided or lamps.count > 0):
             unknown.copy_(compared.without_lamps.log_radiance)
-            lamps.place(no_lamps, no_lamps)
+            lamps.switch_off()
             return measured
     else:
         found = start.fit(target, objective)
