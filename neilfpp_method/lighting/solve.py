@@ -79,16 +79,16 @@ def solve_light(
     measured = None
     if config.kind == "auto":
         compared = _compare_at_held_back_points(map_only, start, target, objective, FOLDS if first else 1)
-        found, measured = compared.with_lamps, compared.evidence
+        fitted, measured = compared.with_lamps, compared.evidence
         if not measured.favours(chosen=lamps_if_undecided or lamps.count > 0):
             unknown.copy_(compared.without_lamps.log_radiance)
             lamps.switch_off()
             return measured
     else:
-        found = start.fit(target, objective)
-    unknown.copy_(found.log_radiance)
+        fitted = start.fit(target, objective)
+    unknown.copy_(fitted.log_radiance)
     reach = from_candidates.sources[0].mean(0)
-    merged = merge_lamps(places, found.intensity, reach, max_lamps=len(lamps.position))
+    merged = merge_lamps(places, fitted.intensity, reach, max_lamps=len(lamps.position))
     _settle(lamps, merged, map_only, points, objective)
     return measured
 
@@ -104,9 +104,9 @@ def _settle(
     map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
     settled = settle_lamps(merged, lamps.radius, map_light, points, objective)
     transport = map_only.transport.concatenate(points.from_lamps(settled.places, lamps.radius))
-    found = CarriedLight(MapAndLamps(unknown, settled.intensity), transport).fit(points.target, objective)
-    unknown.copy_(found.log_radiance)
-    lamps.place(settled.places.position, found.intensity, settled.places.axis)
+    fitted = CarriedLight(MapAndLamps(unknown, settled.intensity), transport).fit(points.target, objective)
+    unknown.copy_(fitted.log_radiance)
+    lamps.place(settled.places.position, fitted.intensity, settled.places.axis)
 
 
 def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> CarriedLight:
