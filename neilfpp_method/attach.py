@@ -81,8 +81,11 @@ class AttachedNeilf(nn.Module):
         self.places = PlaceSolver(model.facts.response, log.warning)
         self.missing = missing_capabilities(_inner(model.host))
         host, config, facts = model.host, model.config, model.facts
-        traced = model.borrowed and config.inter_reflection.mode != "off"
-        render = host.render if traced and answers_secondary_rays(_inner(host)) else None
+        # Only tracing light between surfaces needs a host that renders rays from any viewpoint.
+        renders_secondary_rays = (
+            model.borrowed and config.inter_reflection.mode != "off" and answers_secondary_rays(_inner(host))
+        )
+        render = host.render if renders_secondary_rays else None
         self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render)
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
@@ -243,8 +246,9 @@ class AttachedNeilf(nn.Module):
             self.health()
 
     def _position(self, step: int | Stage | str) -> StagePosition:
+        """The position of a step in its stage, for the index of the step or the name of the stage."""
         if isinstance(step, str):
-            # The position of a stage by name is unknown: step 0 of 2 never is the last step of the stage.
+            # Only the stage is known. Step 0 of 2 is not the last step, at which the health is judged.
             return StagePosition(Stage(step), 0, 2)
         return stage_at(int(step), self.model.config.train)
 
@@ -265,6 +269,7 @@ class AttachedNeilf(nn.Module):
             return host.camera_hits(rays)
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
+        """Check the hits of a training step, keep them for `health`, and add them to the proxy."""
         if len(batch) == 0:
             return
         self.first_batches.hits(batch, hits)

@@ -98,8 +98,9 @@ class NeilfModel(nn.Module):
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         # The light starts at the radiance under which the initial material has the images' median radiance.
-        first, lobe = config.brdf, _specular_lobe(config.shading)
-        albedo = initial_albedo(first.initial_base_color, first.initial_metallic, lobe)
+        albedo = initial_albedo(
+            config.brdf.initial_base_color, config.brdf.initial_metallic, _specular_lobe(config.shading)
+        )
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)

@@ -10,15 +10,18 @@ import pytest
 from neilfpp_method.cli import main
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import NeilfConfig
-from tests.train.small_runs import small_config
+from tests.train.small_runs import short_light_fits, small_config
 
 
 def train_tiny(
     capture: Path, out: Path, *options: object, config: Callable[[], NeilfConfig] = small_config
 ) -> Path:
-    """Train a run with the command line and return its folder; `config` makes the settings."""
+    """Train a run with the command line and return its folder; `config` makes the settings.
+
+    Light fits are short.
+    """
     command = ["train", "--data", capture, "--out", out, "--preset", "tiny", "--device", "cpu", *options]
-    with pytest.MonkeyPatch.context() as patch:
+    with short_light_fits(), pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "tiny", config)
         assert main([*map(str, command)]) == 0
     return out

@@ -170,8 +170,8 @@ def revised_steps(costs: Costs, planned: Mapping[str, int], at: Progress, budget
     factor = max(0.0, budget - at.seconds - once) / seconds if seconds > 0 else 0.0
 
     steps = dict(planned)
-    most = {name: round(MAX_SHARE * cost.steps) for name, cost in costs.stages.items()}
-    steps[at.stage] = min(at.step + round(factor * left[at.stage]), max(most[at.stage], at.step))
+    max_steps = {name: round(MAX_SHARE * cost.steps) for name, cost in costs.stages.items()}
+    steps[at.stage] = min(at.step + round(factor * left[at.stage]), max(max_steps[at.stage], at.step))
     for name in later:
-        steps[name] = min(max(1, round(factor * left[name])), most[name])
+        steps[name] = min(max(1, round(factor * left[name])), max_steps[name])
     return steps

@@ -35,17 +35,17 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
     )
     if tables:
         listed = read_exposures(tables[0])
-        found = {
+        exposures = {
             image: listed.get(image.relative_to(folder).as_posix(), listed.get(image.name))
             for image in images
         }
         remedy = f"add it to {tables[0]}"
     else:
-        found, remedy = {image: photo_exposure(image) for image in images}, WRITE_A_LIST
-    for image, exposure in found.items():
+        exposures, remedy = {image: photo_exposure(image) for image in images}, WRITE_A_LIST
+    for image, exposure in exposures.items():
         if exposure is None:
             raise UserError(f"{image}: no exposure time", remedy)
-    return found
+    return exposures
 
 
 def photo_exposure(path: Path) -> float | None:

@@ -36,10 +36,12 @@ class Outline:
         return not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
 
 
-def read_outlines(views: Sequence[View], most: int = MAX_VIEWS, longest: int = MAX_SIDE) -> list[Outline]:
-    """Read the silhouettes of at most `most` evenly chosen views from their masks or alpha channels.
+def read_outlines(
+    views: Sequence[View], max_views: int = MAX_VIEWS, max_side: int = MAX_SIDE
+) -> list[Outline]:
+    """Read the silhouettes of at most `max_views` evenly chosen views from their masks or alpha channels.
 
-    Masks with more than `longest` pixels a side are reduced, and a pixel is inside if most of it was. The
+    Masks with more than `max_side` pixels a side are reduced, and a pixel is inside if most of it was. The
     cameras of the returned views have the size of the silhouettes.
 
     Returns:
@@ -48,18 +50,18 @@ def read_outlines(views: Sequence[View], most: int = MAX_VIEWS, longest: int = M
     Raises:
         UserError: a mask cannot be read.
     """
-    chosen = views[:: -(-len(views) // most)]
+    chosen = views[:: -(-len(views) // max_views)]
     outlines = []
     for view in chosen:
         image = read_image(view.mask or view.image)
         values = image.alpha if view.mask is None else image.mask
         if values is not None:
-            outlines.append(_outline(view, values > 0.5, longest))
+            outlines.append(_outline(view, values > 0.5, max_side))
     return outlines if len(outlines) >= len(chosen) / 2 else []
 
 
-def _outline(view: View, mask: Bool[np.ndarray, "H W"], longest: int) -> Outline:
-    factor = longest / max(mask.shape)
+def _outline(view: View, mask: Bool[np.ndarray, "H W"], max_side: int) -> Outline:
+    factor = max_side / max(mask.shape)
     if factor < 1:
         height, width = (max(1, round(factor * side)) for side in mask.shape)
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5

@@ -68,8 +68,8 @@ class DistanceCube:
         within = x.clamp(-edge, edge)
         # In `grid_sample`, x is the last axis, and −1 and 1 are the outer faces of the outermost cells.
         place = (within / self.radius).flip(-1).view(1, -1, 1, 1, 3)
-        found = torch.nn.functional.grid_sample(grid[None, None], place, mode="bilinear", align_corners=False)
-        return found.view(-1) + (x - within).square().sum(-1).sqrt()
+        value = torch.nn.functional.grid_sample(grid[None, None], place, mode="bilinear", align_corners=False)
+        return value.view(-1) + (x - within).square().sum(-1).sqrt()
 
 
 def find_hull(
@@ -119,9 +119,9 @@ def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> 
     seen_by, excluded_by = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     # Small silhouettes exclude the most points, so fewer points remain for the following views.
     for outline in sorted(outlines, key=lambda outline: float(outline.inside.mean())):
-        found = sightings([outline], points[candidates])
-        seen_by[candidates] += found.visible_in
-        excluded_by[candidates] += found.visible_in - found.inside
+        counts = sightings([outline], points[candidates])
+        seen_by[candidates] += counts.visible_in
+        excluded_by[candidates] += counts.visible_in - counts.inside
         candidates = candidates[excluded_by[candidates] <= MAX_EXCLUDING_SHARE * len(outlines)]
     hull = np.zeros(len(points), bool)
     enough_views = seen_by[candidates] >= max(2, MIN_SEEN_SHARE * len(outlines))

@@ -7,7 +7,7 @@ minimised, so that a view in which the point is occluded or has a highlight has 
 Reflections can look like exposure: a table that mirrors a window in some photographs is brighter there at
 all of its points. But a gain belongs to the photograph, whereas such a reflection depends on the orientation
 of the surface. So the gains are fitted to points of one orientation and evaluated at points of another, in
-both directions, and the smaller of the two improvements counts.
+both directions, and the smaller of the two reductions of the error counts.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def judge_gains(log_values: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]
         normal: unit normals of the points.
 
     Returns:
-        The smaller of the two improvements; one with too few samples if either has too few.
+        The smaller of the two reductions. If one of the two has too few samples for a decision, that one.
     """
     what = "reduction of the error by gains, at points of another orientation"
     group, measured = _split_by_orientation(normal), []
@@ -93,8 +93,8 @@ def judge_gains(log_values: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]
         gain = _gains(log_values[~held_back])
         saved = _error(log_values[held_back], torch.zeros_like(gain)) - _error(log_values[held_back], gain)
         measured.append(mean_of(saved[~saved.isnan()], what, WORTH))
-    undecided = [one for one in measured if one.favours(chosen=False) is None]
-    return (undecided or sorted(measured, key=lambda one: one.value))[0]
+    undecided = [measurement for measurement in measured if measurement.favours(chosen=False) is None]
+    return undecided[0] if undecided else min(measured, key=lambda measurement: measurement.value)
 
 
 def _split_by_orientation(normal: Float[Tensor, "P 3"]) -> Bool[Tensor, " P"]:
@@ -124,7 +124,7 @@ def _log_values(pixels: PixelDataset, points: OrientedPoints) -> Float[Tensor, "
         within = (column > 0) & (row > 0) & (column < camera.width - 1) & (row < camera.height - 1)
         at = torch.nonzero(within & (projected.depth > 0) & (_cosine(camera, points) > MIN_COSINE))[:, 0]
         if len(at):
-            log_values[at, number] = _around(pixels, number, column[at], row[at])
+            log_values[at, number] = _log_mean_around(pixels, number, column[at], row[at])
     return log_values
 
 
@@ -134,7 +134,7 @@ def _cosine(camera: Camera, points: OrientedPoints) -> Float[Tensor, " P"]:
     return (torch.nn.functional.normalize(to_camera, dim=-1) * points.normal).sum(-1)
 
 
-def _around(pixels: PixelDataset, number: int, column: Tensor, row: Tensor) -> Float[Tensor, "N 3"]:
+def _log_mean_around(pixels: PixelDataset, number: int, column: Tensor, row: Tensor) -> Float[Tensor, "N 3"]:
     """Logarithm of the mean over the 3 × 3 pixels around each given pixel.
 
     It is NaN if one of the nine is clipped, invalid or off the object, or if their mean is too dark.

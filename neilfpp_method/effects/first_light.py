@@ -165,20 +165,20 @@ def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -
 
 
 @torch.no_grad()
-def start_with(model: NeilfModel, solver: LightSolver, found: FirstLight) -> Evidence | None:
+def start_with(model: NeilfModel, solver: LightSolver, first: FirstLight) -> Evidence | None:
     """Set the light of a model and the initial material of its untrained BRDF field, and look for lamps.
 
     Returns:
         The evidence for lamps, as `LightSolver.start` returns it.
     """
-    log_radiance = found.log_radiance
+    log_radiance = first.log_radiance
     model.light.resample(
         log_radiance.mean(0, keepdim=True).expand_as(log_radiance)
         if model.config.light.monochrome
         else log_radiance
     )
-    model.brdf.start_at(found.mean)
-    return solver.start(found.observed, found.material, model.scene, found.lamp_trial)
+    model.brdf.start_at(first.mean)
+    return solver.start(first.observed, first.material, model.scene, first.lamp_trial)
 
 
 def _rescaled(fits: Mapping[float, PlaceFit], scale: float) -> PlaceFit:

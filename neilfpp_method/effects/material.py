@@ -104,7 +104,7 @@ def material_evidence(
     Returns:
         A measurement for each name. It has no samples if no place is seen by `MIN_VIEWS` views.
     """
-    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).in_views(MIN_VIEWS)
+    places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).with_at_least(MIN_VIEWS)
     if not len(places.place):
         return {name: Measurement("views of the same place", 0.0, 0.0, WORTH, 0) for name in names}
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)

@@ -154,11 +154,11 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     best = metal.where(metal.loss < paint.loss, paint)
     roughness = current.roughness[:, 0]
     is_matte = (roughness >= MATTE_ROUGHNESS) & (paint.loss < MATTE_RATIO * best.loss)
-    found = best.where(~is_matte, paint)
-    material = on_grid(found.base_color, found.roughness, found.metallic)
+    chosen = best.where(~is_matte, paint)
+    material = on_grid(chosen.base_color, chosen.roughness, chosen.metallic)
     is_other = (current.metallic - material.metallic)[:, 0] >= MIN_CHANGE
     is_judged = (roughness >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
-    is_better = is_other & is_judged & (found.loss < MAX_RATIO * loss)
+    is_better = is_other & is_judged & (chosen.loss < MAX_RATIO * loss)
     material = _where(is_better[place], material[place], model.brdf(places.observed.position))
     return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
 

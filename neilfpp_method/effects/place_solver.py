@@ -97,7 +97,7 @@ class PlaceSolver(nn.Module):
         same = (observed.normal * center.normal[place]).sum(-1) > SAME_NORMAL
         fold = torch.arange(count, device=place.device) % FOLDS
         places = Places(len(center), place, fold, observed)
-        return places.where(torch.nonzero(same)[:, 0]).in_views(MIN_PIXELS)
+        return places.where(torch.nonzero(same)[:, 0]).with_at_least(MIN_PIXELS)
 
     def _start_light(self, model: NeilfModel, light_solver: LightSolver) -> None:
         """Set an initial light and material that explain the places (`effects.first_light`).

@@ -57,15 +57,15 @@ class Places:
         """The same places with only some of the pixels."""
         return Places(self.count, self.place[rows], self.view[rows], self.observed[rows])
 
-    def in_views(self, least: int) -> Places:
-        """The same places with only the pixels of places that at least this many views show."""
-        views = torch.bincount(self.place, minlength=self.count)
-        return self.where(torch.nonzero(views[self.place] >= least)[:, 0])
+    def with_at_least(self, min_pixels: int) -> Places:
+        """The same places, without the pixels of places that have fewer than `min_pixels`."""
+        pixels = torch.bincount(self.place, minlength=self.count)
+        return self.where(torch.nonzero(pixels[self.place] >= min_pixels)[:, 0])
 
-    def first(self, most: int) -> Places:
-        """The first places, as many as have at most `most` pixels together."""
+    def first(self, max_pixels: int) -> Places:
+        """The same places, with the pixels of the first ones that have at most `max_pixels` together."""
         total = torch.bincount(self.place, minlength=self.count).cumsum(0)
-        return self.where(torch.nonzero(total[self.place] <= most)[:, 0])
+        return self.where(torch.nonzero(total[self.place] <= max_pixels)[:, 0])
 
     def mean(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "P ..."]:
         """Mean of values over the pixels of each place; 0 for a place without pixels."""
@@ -87,7 +87,7 @@ def gather_places(
     normal: Float[Tensor, "P 3"],
     views: int,
 ) -> Places:
-    """Collect the pixels that show given surface points.
+    """Collect the pixels that show given surface points, at most one per point and view.
 
     Args:
         model: its host renders the surface point of each pixel.

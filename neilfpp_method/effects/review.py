@@ -120,18 +120,18 @@ class LightReview:
 
 @torch.no_grad()
 def review_light(
-    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, most: int = MAX_PIXELS
+    plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int, max_pixels: int = MAX_PIXELS
 ) -> LightReview:
     """Decide on the specular lobe and on metals if these are open, and find an initial light.
 
     The model uses the settings of the plan afterwards. The arguments are those of `review_surface`, and
-    `most`, the maximum number of pixels of the places; below `MIN_PIXELS` nothing is measured.
+    `max_pixels`, the maximum number of pixels of the places; below `MIN_PIXELS` nothing is measured.
     """
     if len(pixels.views) < MIN_TRAIN_VIEWS:
         return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views")
-    if most < MIN_PIXELS:
+    if max_pixels < MIN_PIXELS:
         return _not_measured(plan, step, "the budget leaves no time for it")
-    places = light_places(model, pixels, most)
+    places = light_places(model, pixels, max_pixels)
     if places.shown_count < MIN_PLACES:
         return _not_measured(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
     with model.evaluating():
@@ -156,13 +156,14 @@ def _review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) -
 
 
 @torch.no_grad()
-def light_places(model: NeilfModel, pixels: PixelDataset, most: int = MAX_PIXELS) -> Places:
-    """Places on the visible surface that several training views show, with at most `most` pixels."""
+def light_places(model: NeilfModel, pixels: PixelDataset, max_pixels: int = MAX_PIXELS) -> Places:
+    """Places on the visible surface that several training views show, with at most `max_pixels` pixels."""
     with model.evaluating():
         surface = _rendered_surface(model, pixels.sample(LIGHT_PIXELS, gradients=False)).observed
-        count = min(PLACES, most // USUAL_VIEWS)
+        count = min(PLACES, max_pixels // USUAL_VIEWS)
         position, normal = surface.position[:count], surface.normal[:count]
-        return gather_places(model, pixels, position, normal, VIEWS).in_views(MIN_VIEWS).first(most)
+        places = gather_places(model, pixels, position, normal, VIEWS)
+        return places.with_at_least(MIN_VIEWS).first(max_pixels)
 
 
 def improve_material(model: NeilfModel, places: Places) -> str | None:

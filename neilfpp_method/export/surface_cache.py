@@ -74,11 +74,11 @@ def extracted_surface(
     """
     path = run.path / "cache" / f"surface-{resolution}.npz"
     made_from = _fingerprint(run, resolution)
-    found = None if made_from is None else read_surface(path, made_from, say)
-    surface = found or _extract(run, resolution)
+    stored = None if made_from is None else read_surface(path, made_from, say)
+    surface = stored or _extract(run, resolution)
     if shaded and surface.normals is None:
         surface = _with_normals(run, surface)
-    if keep and made_from is not None and surface is not found:
+    if keep and made_from is not None and surface is not stored:
         try:
             write_surface(path, surface, made_from)
         except UserError as error:
@@ -156,15 +156,15 @@ def read_surface(path: Path, made_from: str, say: Callable[[str], None]) -> Extr
     if not path.is_file():
         return None
     try:
-        found = _checked(path, made_from)
+        surface = _checked(path, made_from)
     except Exception as error:
         # For a damaged archive, zipfile, zlib and numpy raise many types of exceptions.
         reason = " ".join(str(error).split())[:100] or type(error).__name__
         say(f"{path}: damaged ({reason}); the surface is extracted again")
         return None
-    if found is None:
+    if surface is None:
         say(f"{path}: made from other weights or by another version; the surface is extracted again")
-    return found
+    return surface
 
 
 def _checked(path: Path, made_from: str) -> ExtractedSurface | None:

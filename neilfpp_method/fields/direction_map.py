@@ -20,9 +20,15 @@ __all__ = [
     "interpolate",
     "map_directions",
     "texel_centers",
+    "texel_means",
     "texel_solid_angles",
     "texels_of",
 ]
+
+NEIGHBOR_WEIGHT, TEXEL_WEIGHT = 1 / 8, 3 / 4
+"""Weights of each of the two neighbours and of the texel itself in the mean, over a texel, of linear
+interpolation along one axis.
+"""
 
 
 def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
@@ -41,6 +47,13 @@ def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor,
     """Row-major index of the texel that contains a unit direction."""
     column, row = _columns_and_rows(wi, height, width)
     return (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
+
+
+def texel_means(values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
+    """Mean over each texel of the bilinear interpolation of a map."""
+    means = NEIGHBOR_WEIGHT * (values.roll(1, 1) + values.roll(-1, 1)) + TEXEL_WEIGHT * values
+    above, below = torch.cat((means[:1], means[:-1])), torch.cat((means[1:], means[-1:]))
+    return NEIGHBOR_WEIGHT * (above + below) + TEXEL_WEIGHT * means
 
 
 def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:

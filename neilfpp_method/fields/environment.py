@@ -18,6 +18,7 @@ from neilfpp_method.fields.direction_map import (
     directions_within,
     interpolate,
     map_directions,
+    texel_means,
     texel_solid_angles,
 )
 from neilfpp_method.fields.map_sampling import radiance_times_cosine
@@ -28,10 +29,6 @@ __all__ = ["EVEN_ROWS", "EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
 """Share of the samples that ignore the radiance, so that the density is positive above every horizon."""
-MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""Weights of each neighbour and of the cell itself in the mean, over a cell, of the linear interpolation
-between cell centres.
-"""
 EVEN_ROWS = 16
 """Rows of the map of an even light. Its texels are all equal; they are the directions that a fit samples."""
 MIN_RADIANCE = 1e-6
@@ -146,12 +143,8 @@ class EnvironmentLight(nn.Module):
 
         The interpolation also brightens the neighbours of a bright texel, so their probability is higher.
         """
-        solid_angle = self._texel_solid_angles()
-        mean = luminance(self.log_radiance.permute(1, 2, 0).exp())
-        mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
-        above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
-        mean = MEAN_OF_CELL[0] * (above + below) + MEAN_OF_CELL[1] * mean
-        solid_angle = solid_angle.view_as(mean)
+        mean = texel_means(luminance(self.log_radiance.permute(1, 2, 0).exp()))
+        solid_angle = self._texel_solid_angles().view_as(mean)
         power = mean * solid_angle
         return (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * solid_angle / (4 * math.pi)
 

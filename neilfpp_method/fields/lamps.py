@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from neilfpp_method.shading.frame import dot, safe_normalize
 from neilfpp_method.structures import IncidentSamples, Indexable
 
-__all__ = ["LampPlaces", "LampRays", "Lamps", "rays_towards"]
+__all__ = ["LampPlaces", "LampRays", "Lamps", "emission", "rays_towards"]
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,10 @@ class Lamps(nn.Module):
             self.axis[: self.count] = axis[: self.count]
         self.intensity.zero_()[: self.count] = intensity[: self.count]
 
+    def switch_off(self) -> None:
+        """Remove all lamps."""
+        self.place(self.position[:0], self.intensity[:0])
+
     @property
     def lit_places(self) -> LampPlaces:
         """Positions and axes of the lit lamps."""
@@ -119,7 +123,7 @@ class Lamps(nn.Module):
             along = dot(wi, offset)
             miss = offset.square().sum(-1)[:, None] - along.square()
             hit = (along > 0) & (miss < self.radius**2) & (along < before)
-            total = total + (hit * _emission(wi, axis))[..., None] * radiance
+            total = total + (hit * emission(wi, axis))[..., None] * radiance
         return total
 
     def get_extra_state(self) -> dict[str, int]:
@@ -138,10 +142,10 @@ def rays_towards(
     offset = position - x[:, None]
     distance = offset.square().sum(-1).clamp_min((2 * radius) ** 2).sqrt()
     wi = safe_normalize(offset)
-    return LampRays(wi, distance, math.pi * radius**2 / distance.square(), _emission(wi, axis))
+    return LampRays(wi, distance, math.pi * radius**2 / distance.square(), emission(wi, axis))
 
 
-def _emission(wi: Float[Tensor, "N K 3"], axis: Float[Tensor, "*K 3"]) -> Float[Tensor, "N K"]:
-    """Share of its intensity that a lamp with this axis sends along −wi."""
+def emission(wi: Float[Tensor, "*B 3"], axis: Float[Tensor, "*A 3"]) -> Float[Tensor, "*B"]:
+    """Share of its intensity that a lamp with this axis sends along −wi; `axis` broadcasts to `wi`."""
     is_isotropic = axis.square().sum(-1) == 0
     return torch.where(is_isotropic, 1.0, (-(wi * axis).sum(-1)).clamp_min(0))

@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.other_viewpoints import other_viewpoints
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
-from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
+from neilfpp_method.structures import OrientedPoints, PixelBatch, RayBatch, SurfaceHits
 
 __all__ = ["FirstBatches"]
 
@@ -44,8 +44,6 @@ BACKGROUND_MISSES = "give its rays a concentration of 0, and for a function a no
 """Remedy for a background that counts as a surface."""
 MAX_REVIEWED_HITS = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
-VIEWPOINT_TANGENT = 0.6
-"""Tangent of the angle between the other viewpoint and the direction halfway between normal and viewer."""
 MAX_DISTANCE = 0.01
 """Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
 MAX_DISTANT_SHARE = 0.4
@@ -223,12 +221,10 @@ class FirstBatches:
         """
         rows = torch.nonzero(hit)[:, 0]
         rows = rows[:: math.ceil(len(rows) / MAX_REVIEWED_HITS)]
-        position, back = hits.position[rows], -batch.directions[rows]
-        distance = (position - batch.origins[rows]).norm(dim=-1, keepdim=True)
-        tangent = normalize(torch.linalg.cross(hits.normal[rows], back.roll(1, dims=-1)), dim=-1)
-        way = normalize(hits.normal[rows] + back + VIEWPOINT_TANGENT * tangent, dim=-1)
+        position = hits.position[rows]
+        others = other_viewpoints(batch.rays[rows], OrientedPoints(position, hits.normal[rows]))
         with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
-            again = render(RayBatch(position + distance * way, -way))
+            again = render(others.rays(others.distance))
         same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < MAX_DISTANCE)
         moved = 1.0 - same.float().mean().item()
         if moved > MAX_DISTANT_SHARE:

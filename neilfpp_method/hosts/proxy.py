@@ -20,9 +20,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from neilfpp_method.hosts.answers import no_hits
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.shading.frame import safe_normalize
-from neilfpp_method.structures import RayBatch, SceneLight, SurfaceHits
+from neilfpp_method.structures import Indexable, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.volume.distance_grid import GridHits, look_up, trace_grid
 from neilfpp_method.volume.fusion import FusedSurface, fuse_surface, grid_normal, mean_at
 
@@ -79,6 +80,28 @@ class ProxyReport:
 
 
 @dataclass(frozen=True)
+class StoredPoints(Indexable):
+    """Surface points in the memory of the proxy; its tensors are views of that memory.
+
+    Attributes:
+        position: the points, scene frame.
+        normal: their outward unit normals; zero for a point that has been removed.
+        radiance: linear radiance that was observed there.
+        step: number of steps observed when the point was added.
+    """
+
+    position: Float[Tensor, "P 3"]
+    normal: Float[Tensor, "P 3"]
+    radiance: Float[Tensor, "P 3"]
+    step: Float[Tensor, "P 1"]
+
+    @property
+    def is_valid(self) -> Bool[Tensor, " P"]:
+        """Which points have not been removed."""
+        return self.normal.square().sum(-1) > 0
+
+
+@dataclass(frozen=True)
 class ObservedRays:
     """Camera rays with the distances of the host's hits, infinite for a miss."""
 
@@ -123,8 +146,7 @@ class SurfaceProxy(nn.Module):
         self.radius = radius
         self.resolution = resolution
         self.hit_share = hit_share
-        # Columns: position, normal, radiance, and the step in which the point was observed. A zero normal
-        # marks a removed point.
+        # Rows as in `StoredPoints`.
         self.points = Ring(POINTS, 10)
         self.steps = 0
         self._radiance = radiance
@@ -198,23 +220,27 @@ class SurfaceProxy(nn.Module):
         self.points.keep(torch.cat((points, stamp), -1)[hit].flip(0))
         self._surface = self._fused()
 
+    def _stored(self) -> StoredPoints:
+        return StoredPoints(*self.points.kept().split((3, 3, 3, 1), -1))
+
     def _fused(self) -> FusedSurface:
-        rows = self.points.kept()
-        rows = rows[rows[:, 3:6].square().sum(-1) > 0]
-        return fuse_surface(rows[:, :3], rows[:, 3:6], rows[:, 6:9], self.radius, self.resolution)
+        """The surface of the stored points."""
+        stored = self._stored()
+        valid = stored[stored.is_valid]
+        return fuse_surface(valid.position, valid.normal, valid.radiance, self.radius, self.resolution)
 
     def _compare(self, observed: ObservedRays, traced: GridHits) -> ProxyReport:
         """Compare new rays of the host with those through the grid."""
         hit = observed.distance.isfinite()
         error = (traced.distance - observed.distance)[hit & traced.hit].abs()
-        rows = self.points.kept()
-        valid = rows[:, 3:6].square().sum(-1) > 0
+        stored = self._stored()
+        valid = stored.is_valid
         median, error_95 = (
             error.quantile(torch.tensor([0.5, 0.95]).to(error)).tolist() if len(error) else (0.0, 0.0)
         )
         return ProxyReport(
             points=int(valid.sum()),
-            age=(self.steps - rows[valid, 9]).mean().item() if valid.any() else 0.0,
+            age=(self.steps - stored.step[valid, 0]).mean().item() if valid.any() else 0.0,
             agreement=(hit == traced.hit).float().mean().item() if len(hit) else 1.0,
             error=median,
             error_95=error_95,
@@ -230,9 +256,9 @@ class SurfaceProxy(nn.Module):
         # Points in neighbouring cells are removed as well.
         volume = stale.view(1, 1, *[self.resolution] * 3).float()
         stale = nn.functional.max_pool3d(volume, 3, 1, 1).view(-1) > 0
-        # `rows` is a view of the ring: this writes to the stored points.
-        rows = self.points.kept()
-        rows[stale[self._cells(rows[:, :3])], 3:6] = 0.0
+        stored = self._stored()
+        # This writes to the memory, of which `normal` is a view.
+        stored.normal[stale[self._cells(stored.position)]] = 0.0
 
     def _cells(self, x: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
         """Index of the vertex closest to each point."""
@@ -256,32 +282,32 @@ class SurfaceProxy(nn.Module):
         height = look_up(surface.distance, self.radius, x)
         lift = (START * self.cell - height).clamp(0, (START + 1) * self.cell)
         start = (x + lift[:, None] * normal)[:, None].expand_as(wi).reshape(-1, 3)
-        found = self._trace(RayBatch(start, directions))
-        rows = torch.nonzero(found.hit)[:, 0]
-        place = start[rows] + found.distance[rows, None] * directions[rows]
+        traced = self._trace(RayBatch(start, directions))
+        rows = torch.nonzero(traced.hit)[:, 0]
+        position = start[rows] + traced.distance[rows, None] * directions[rows]
         radiance = torch.zeros_like(directions)
-        radiance[rows] = self._outgoing(place, -directions[rows])
+        radiance[rows] = self._outgoing(position, -directions[rows])
         origin = x[:, None].expand_as(wi).reshape(-1, 3)[rows]
         distance = torch.full_like(directions[:, 0], torch.inf)
-        distance[rows] = (place - origin).norm(dim=-1)
-        return SceneLight(found.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
+        distance[rows] = (position - origin).norm(dim=-1)
+        return SceneLight(traced.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Hits of rays with the grid's surface, without gradient; the colour of a miss is black."""
         surface = self._known_surface()
-        nothing, zero = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
+        missed = no_hits(rays)
         if surface is None:
-            return SurfaceHits(nothing, rays.origins, nothing, zero, zero)
-        found = self._trace(rays)
-        rows = torch.nonzero(found.hit)[:, 0]
-        place = rays.origins[rows] + found.distance[rows, None] * rays.directions[rows]
-        normal = grid_normal(surface.distance, self.radius, place)
-        share = found.hit.to(zero.dtype)
+            return missed
+        traced = self._trace(rays)
+        rows = torch.nonzero(traced.hit)[:, 0]
+        position = rays.origins[rows] + traced.distance[rows, None] * rays.directions[rows]
+        normal = grid_normal(surface.distance, self.radius, position)
+        share = traced.hit.to(missed.opacity.dtype)
         return SurfaceHits(
-            color=nothing.index_put((rows,), self._outgoing(place, -rays.directions[rows])),
-            position=rays.origins.index_put((rows,), place),
-            normal=nothing.index_put((rows,), normal),
+            color=missed.color.index_put((rows,), self._outgoing(position, -rays.directions[rows])),
+            position=missed.position.index_put((rows,), position),
+            normal=missed.normal.index_put((rows,), normal),
             opacity=share,
             concentration=share,
         )
@@ -290,15 +316,15 @@ class SurfaceProxy(nn.Module):
         """Error of the proxy; None before the second refresh."""
         return self._report
 
-    def _outgoing(self, place: Float[Tensor, "P 3"], wo: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-        """Radiance of surface points towards wo: that of the host, or the mean observed radiance."""
-        if self._radiance is not None and len(place):
-            return self._radiance(place, wo)
-        return mean_at(self._surface, self.radius, place)
+    def _outgoing(self, x: Float[Tensor, "P 3"], wo: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+        """Radiance of surface points x towards wo: that of the host, or the mean observed radiance."""
+        if self._radiance is not None and len(x):
+            return self._radiance(x, wo)
+        return mean_at(self._surface, self.radius, x)
 
     def _known_surface(self) -> FusedSurface | None:
+        """The surface of the last refresh, made again after a checkpoint; None before the first refresh."""
         if self._surface is None and self.points.filled:
-            # The points come from a checkpoint.
             self._surface = self._fused()
         return self._surface
 
@@ -307,15 +333,15 @@ class SurfaceProxy(nn.Module):
         grid = self._known_surface().distance
         entry = self._entry(rays)
         start = rays.origins + entry.distance[:, None] * rays.directions
-        found = trace_grid(grid, self.radius, start, rays.directions)
-        hit = found.hit & entry.passes
+        traced = trace_grid(grid, self.radius, start, rays.directions)
+        hit = traced.hit & entry.passes
         # Tracing ends a quarter cell above the surface; a Newton step covers the rest.
         rows = torch.nonzero(hit)[:, 0]
         directions = rays.directions[rows]
-        place = start[rows] + found.distance[rows, None] * directions
-        cosine = -(grid_normal(grid, self.radius, place) * directions).sum(-1)
-        rest = (look_up(grid, self.radius, place) / cosine.clamp_min(GRAZING)).clamp(-self.cell, self.cell)
-        return GridHits((entry.distance + found.distance).index_add(0, rows, rest), hit)
+        end = start[rows] + traced.distance[rows, None] * directions
+        cosine = -(grid_normal(grid, self.radius, end) * directions).sum(-1)
+        rest = (look_up(grid, self.radius, end) / cosine.clamp_min(GRAZING)).clamp(-self.cell, self.cell)
+        return GridHits((entry.distance + traced.distance).index_add(0, rows, rest), hit)
 
     def _entry(self, rays: RayBatch) -> CubeEntry:
         direction = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from neilfpp_method.hosts.other_viewpoints import OtherViewpoints, other_viewpoints
 from neilfpp_method.hosts.testing_case import HIT_SHARE, Case
-from neilfpp_method.structures import RayBatch
+from neilfpp_method.structures import OrientedPoints, RayBatch
 
 __all__ = ["GEOMETRY_CHECKS"]
 
@@ -22,8 +23,6 @@ AGREE = 0.6
 """Smallest share of points that agree in both views. The others may be occluded or on a silhouette."""
 NEAR = 0.05
 """Distance from which rays between surfaces may see a point, scene units."""
-ASIDE = 0.6
-"""Tangent of the angle between both views."""
 BESIDE = 0.01
 """Distance between neighbouring rays, scene units."""
 STEEP = 8.0
@@ -41,23 +40,23 @@ def _in_the_sphere(case: Case) -> None:
 
 
 def _another_view(case: Case) -> None:
-    position, distance, aside = _places(case)
-    _require_same_hits(case, position, normalize(aside, dim=-1), distance, "another view")
+    others = _other_viewpoints(case)
+    rays = others.rays(others.distance)
+    _require_same_hits(case, others.position, rays, "another view", "is the depth a distance along the ray?")
 
 
 def _from_afar(case: Case) -> None:
-    position, distance, _ = _places(case)
-    _require_same_hits(
-        case, position, -case.rays.directions[case.hit], 2 * distance, "twice the distance", "a far plane?"
-    )
+    position, back = case.hits.position.detach()[case.hit], -case.rays.directions[case.hit]
+    distance = (position - case.rays.origins[case.hit]).norm(dim=-1)
+    rays = RayBatch(position + 2 * distance[:, None] * back, -back)
+    _require_same_hits(case, position, rays, "twice the distance", "a far plane?")
 
 
 def _from_close_by(case: Case) -> None:
-    position, distance, aside = _places(case)
-    broken = "light between surfaces would not see it (a near plane?)"
-    _require_same_hits(
-        case, position, normalize(aside, dim=-1), torch.full_like(distance, NEAR), f"{NEAR} away", broken
-    )
+    others = _other_viewpoints(case)
+    rays = others.rays(torch.full_like(others.distance, NEAR))
+    suspect = "light between surfaces would not see it (a near plane?)"
+    _require_same_hits(case, others.position, rays, f"{NEAR} away", suspect)
 
 
 def _normals_of_neighbors(case: Case) -> None:
@@ -83,23 +82,26 @@ def _normals_of_neighbors(case: Case) -> None:
     case.require(angle < TILTED, f"{broken}: take the gradient of the field that is rendered")
 
 
-def _places(case: Case) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions of hits, their distances, and directions from which they should be visible as well."""
+def _other_viewpoints(case: Case) -> OtherViewpoints:
     position, normal = case.hits.position.detach()[case.hit], case.hits.normal.detach()[case.hit]
-    back = -case.rays.directions[case.hit]
-    tangent = normalize(torch.linalg.cross(normal, back.roll(1, dims=-1)), dim=-1)
-    return position, (position - case.rays.origins[case.hit]).norm(dim=-1), normal + back + ASIDE * tangent
+    return other_viewpoints(case.rays[torch.nonzero(case.hit)[:, 0]], OrientedPoints(position, normal))
 
 
-def _require_same_hits(
-    case: Case, position: Tensor, way: Tensor, distance: Tensor, viewpoint: str, broken: str = ""
-) -> None:
-    start = position + distance[:, None] * way
-    again = case.constants(RayBatch(start, -way))
+def _require_same_hits(case: Case, position: Tensor, rays: RayBatch, viewpoint: str, suspect: str) -> None:
+    """Require that most rays hit the positions to which they lead.
+
+    Args:
+        case: the host under test.
+        position: surface points that are known from the first view.
+        rays: rays to these points from another viewpoint.
+        viewpoint: description of that viewpoint.
+        suspect: the end of the message: the probable cause, or the consequence.
+    """
+    again = case.constants(rays)
     apart = (again.position - position).norm(dim=-1)
     same = (again.is_hit(HIT_SHARE) & (apart <= APART + 2 * case.width)).float().mean().item()
     lost = f"{1 - same:.0%} of its hits have another position when seen from {viewpoint}"
-    case.require(same >= AGREE, f"{lost}: {broken or 'is the depth a distance along the ray?'}")
+    case.require(same >= AGREE, f"{lost}: {suspect}")
 
 
 GEOMETRY_CHECKS = (_in_the_sphere, _another_view, _from_afar, _from_close_by, _normals_of_neighbors)

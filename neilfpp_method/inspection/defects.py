@@ -178,8 +178,8 @@ def _of_files(views: Sequence[ViewFigures]) -> Iterator[Defect]:
         text, remedy = damaged[0].unreadable, "export these images again, or leave them out"
         yield Defect("unreadable", "problem", text, remedy, _names(damaged))
     if broken := [view for view in views if view.broken > 0]:
-        most = max(view.broken for view in broken)
-        text = f"pixels are NaN, infinite or negative, up to {100 * most:.2g} % of a view"
+        largest = max(view.broken for view in broken)
+        text = f"pixels are NaN, infinite or negative, up to {100 * largest:.2g} % of a view"
         remedy = "repair them, or mark them in a validity mask"
         yield Defect("broken_pixels", "problem", text, remedy, _names(broken))
     if black := [view for view in views if not view.unreadable and view.luminance <= 0]:
@@ -195,7 +195,7 @@ def _of_exposures(
     pairs = zip(views, factors, strict=True)
     jumps = {view.name: factor for view, factor in pairs if max(factor, 1 / factor) > JUMP}
     if jumps:
-        named = _listed([f"{name} ×{factor:.2g}" for name, factor in jumps.items()], most=4)
+        named = _listed([f"{name} ×{factor:.2g}" for name, factor in jumps.items()], max_parts=4)
         text = f"brighter or darker than the views around them: {named}"
         own = "give these views their exposure in capture.json"
         alike = "expose all images alike, or merge brackets"
@@ -210,7 +210,7 @@ def _of_pictures(views: Sequence[ViewFigures]) -> Iterator[Defect]:
         remedy = "leave these views out, or take them again"
         yield Defect("blurred", "warning", text, remedy, _names(blurred))
     if pairs := duplicates([view.small for view in views]) if views else ():
-        named = _listed([f"{views[i].name} and {views[j].name}" for i, j in pairs], most=3)
+        named = _listed([f"{views[i].name} and {views[j].name}" for i, j in pairs], max_parts=3)
         again = tuple(dict.fromkeys(views[j].name for _, j in pairs))
         yield Defect("duplicate", "warning", f"the same picture twice: {named}", "keep one of each", again)
 
@@ -236,9 +236,9 @@ def _names(views: Sequence[ViewFigures]) -> tuple[str, ...]:
     return tuple(view.name for view in views)
 
 
-def _listed(parts: Sequence[str], most: int) -> str:
+def _listed(parts: Sequence[str], max_parts: int) -> str:
     """The first parts, separated by commas, with an ellipsis if there are more."""
-    return ", ".join(parts[:most]) + ("…" if len(parts) > most else "")
+    return ", ".join(parts[:max_parts]) + ("…" if len(parts) > max_parts else "")
 
 
 def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Defect]:

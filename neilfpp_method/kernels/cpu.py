@@ -72,7 +72,7 @@ def point_gradient(
     x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, gradients: OutputGradients
 ) -> Float[Tensor, "N 3"]:
     """See `Kernels`."""
-    found = torch.empty_like(x01)
+    gradient = torch.empty_like(x01)
     grid = _layout(spec)
     fixed = (
         *_arrays(x01, table),
@@ -80,12 +80,12 @@ def point_gradient(
         grid.cells,
         grid.dense,
         *_gradients(gradients),
-        *_arrays(found),
+        *_arrays(gradient),
     )
     for_each(
         lambda start, stop: compiled.point_gradient(*fixed, start, stop), _shares_of_points(len(x01), spec)
     )
-    return found
+    return gradient
 
 
 def _shares_of_points(count: int, spec: GridSpec) -> list[tuple[int, int]]:

@@ -101,6 +101,6 @@ def _through_reference(
     outputs = (encoded.features,) if jacobian is None else (encoded.features, encoded.jacobian)
     gradients = (features,) if jacobian is None else (features, jacobian)
     wanted = [tensor for tensor, needed in zip((x01, table), ctx.needs_input_grad[:2], strict=True) if needed]
-    found = iter(torch.autograd.grad(outputs, wanted, gradients, create_graph=True, allow_unused=True))
-    to_points, to_table = (next(found) if needed else None for needed in ctx.needs_input_grad[:2])
+    derivatives = iter(torch.autograd.grad(outputs, wanted, gradients, create_graph=True, allow_unused=True))
+    to_points, to_table = (next(derivatives) if needed else None for needed in ctx.needs_input_grad[:2])
     return to_points, to_table

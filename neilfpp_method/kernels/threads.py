@@ -17,9 +17,12 @@ import torch
 __all__ = ["for_each", "shares"]
 
 
-def shares(count: int, least: int) -> list[tuple[int, int]]:
-    """Divide `count` items into equal ranges (start, stop): at most one per thread, of `least` or more."""
-    parts = max(1, min(torch.get_num_threads(), count // max(least, 1)))
+def shares(count: int, min_count: int) -> list[tuple[int, int]]:
+    """Divide `count` items into equal ranges (start, stop).
+
+    There are as many ranges as threads, but fewer if a range would have less than `min_count` items.
+    """
+    parts = max(1, min(torch.get_num_threads(), count // max(min_count, 1)))
     edges = [count * part // parts for part in range(parts + 1)]
     return list(itertools.pairwise(edges))
 

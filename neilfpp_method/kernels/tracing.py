@@ -22,30 +22,31 @@ def sphere_trace(
     radius: float,
     origins: Float[Tensor, "P 3"],
     directions: Float[Tensor, "P 3"],
-    least: float,
+    hit_distance: float,
     steps: int,
     distance: Float[Tensor, " P"],
     hit: Bool[Tensor, " P"],
 ) -> None:
-    """Trace rays in a sampled distance field until they come closer to a surface than `least`.
+    """Trace rays in a sampled distance field until they come closer to a surface than `hit_distance`.
 
-    Each step has the length of the distance at its start, but at least `least`. A ray also ends after `steps`
-    steps or when it leaves the cube [−radius, radius]³. All floating-point tensors have the same type.
+    Each step has the length of the distance at its start, but at least `hit_distance`. A ray also ends after
+    `steps` steps or when it leaves the cube [−radius, radius]³. All floating-point tensors have the same
+    type.
 
     Args:
         grid: distances at the vertices z, y, x of the cube.
         radius: half the edge of the cube.
         origins: origins of the rays.
         directions: unit directions of the rays.
-        least: distance at which a surface counts as hit.
+        hit_distance: distance below which a surface counts as hit.
         steps: maximum number of steps.
         distance: receives the length of each ray.
         hit: receives whether each ray has hit a surface.
     """
     vertices, start, towards = (tensor.contiguous().numpy() for tensor in (grid, origins, directions))
-    written, least = (distance.numpy(), hit.numpy()), vertices.dtype.type(least)
+    written, closest = (distance.numpy(), hit.numpy()), vertices.dtype.type(hit_distance)
 
     def trace(first: int, last: int) -> None:
-        compiled.sphere_trace(vertices, radius, start, towards, least, steps, *written, first, last)
+        compiled.sphere_trace(vertices, radius, start, towards, closest, steps, *written, first, last)
 
     for_each(trace, shares(len(origins), MIN_RAYS_PER_THREAD))

@@ -257,16 +257,16 @@ def point_gradient(
     x01: Float[Tensor, "N 3"], table: Float[Tensor, "T F"], spec: GridSpec, gradients: OutputGradients
 ) -> Float[Tensor, "N 3"]:
     """See `Kernels`."""
-    found = torch.empty_like(x01)
+    gradient = torch.empty_like(x01)
     count, levels = len(x01), len(spec.resolutions)
     features, jacobian = gradients.features, _jacobian(gradients)
     with torch.cuda.device_of(x01):
         _point_gradient[(_blocks(count),)](
-            x01, table, _grid(spec, x01.device), features, jacobian, found, count, levels,
+            x01, table, _grid(spec, x01.device), features, jacobian, gradient, count, levels,
             *features.stride(), *jacobian.stride(),
             spec.features, gradients.jacobian is not None, BLOCK, **FUSED,
         )  # fmt: skip
-    return found
+    return gradient
 
 
 def _blocks(count: int) -> int:

@@ -79,7 +79,7 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
 
 @torch.no_grad()
 def merge_lamps(
-    places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], most: int
+    places: LampPlaces, intensity: Float[Tensor, "M 3"], reach: Float[Tensor, " M"], max_lamps: int
 ) -> FoundLamps:
     """Merge neighbouring lamps and drop weak ones.
 
@@ -91,7 +91,7 @@ def merge_lamps(
         intensity: their intensities.
         reach: mean contribution of each lamp, at intensity 1, to the scene; 0 if it is hidden from every
             surface point. The power of a lamp is its intensity times this.
-        most: maximum number of lamps to return.
+        max_lamps: maximum number of lamps to return.
 
     Returns:
         The merged lamps, the strongest first.
@@ -101,7 +101,7 @@ def merge_lamps(
     position, axis = places.position, places.axis
     positions, axes, intensities = [], [], []
     for leader in power.argsort(descending=True).tolist():
-        if len(positions) == most or power[leader] <= MIN_LAMP_SHARE * power.sum():
+        if len(positions) == max_lamps or power[leader] <= MIN_LAMP_SHARE * power.sum():
             break
         if remaining[leader]:
             group = remaining & ((position - position[leader]).norm(dim=-1) < MERGE_DISTANCE)

@@ -27,6 +27,11 @@ class SurfaceMemory(nn.Module):
     Args:
         capacity: number of points in the buffer.
         every: number of steps between two fits.
+
+    Attributes:
+        points: the buffer.
+        waited: number of steps before the first fit.
+        age: number of steps since the last fit; None before the first.
     """
 
     def __init__(self, capacity: int, every: int) -> None:

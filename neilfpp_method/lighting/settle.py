@@ -54,7 +54,7 @@ class _Settled:
 
 @torch.no_grad()
 def settle_lamps(
-    found: FoundLamps,
+    initial: FoundLamps,
     radius: float,
     beside: Transport,
     points: FitPoints,
@@ -68,17 +68,17 @@ def settle_lamps(
     much like a bulb at another.
 
     Args:
-        found: initial lamps, the strongest first.
+        initial: initial lamps, the strongest first.
         radius: radius of every lamp, in scene units.
         beside: transport of all other light, as constant radiance (it has no sources).
         points: the surface points.
         objective: the terms of the loss and their weights.
 
     Returns:
-        The refined lamps; `found` if there are no points or the descent is not finite.
+        The refined lamps; `initial` if there are no points or the descent is not finite.
     """
-    if not len(found.intensity) or not len(points.observed):
-        return found
+    if not len(initial.intensity) or not len(points.observed):
+        return initial
     target, position = points.target, points.observed.position
 
     def loss_of(
@@ -95,18 +95,19 @@ def settle_lamps(
         sight = points.in_sight(lamps.places, radius)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
-    best = settle(found)
+    best = settle(initial)
     if not math.isfinite(best.loss):
-        return found
-    for number in reversed(range(len(found.intensity))):
+        return initial
+    for number in reversed(range(len(initial.intensity))):
         if len(best.lamps.intensity) == 1:
             break
         without = settle(_without(best.lamps, number))
         if without.loss < best.loss:
             best = without
     for number in range(len(best.lamps.intensity)):
-        pair = best, settle(_of_other_kind(best.lamps, number, position))
-        panel, bulb = pair if best.lamps.places.axis[number].any() else reversed(pair)
+        other = settle(_of_other_kind(best.lamps, number, position))
+        is_panel = best.lamps.places.axis[number].any()
+        panel, bulb = (best, other) if is_panel else (other, best)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
     return settle(best.lamps).lamps
 

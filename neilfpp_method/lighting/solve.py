@@ -66,29 +66,29 @@ def solve_light(
     """
     lamps, target = light.lamps, points.target
     map_only = _map_only(light.light, points, is_known=config.map is not None)
-    unknown, no_lamps = map_only.light.log_radiance, map_only.light.intensity
+    unknown = map_only.light.log_radiance
     if config.kind == "distant":
         unknown.copy_(map_only.fit(target, objective).log_radiance)
         return None
 
     places = propose(lamps, points.observed.position, CANDIDATES)
     from_candidates = points.from_lamps(places, lamps.radius)
-    intensity = no_lamps.new_zeros(len(places.position), 3)
+    intensity = unknown.new_zeros(len(places.position), 3)
     intensity[: lamps.count] = lamps.lit_intensity
     start = CarriedLight(MapAndLamps(unknown, intensity), map_only.transport.concatenate(from_candidates))
     measured = None
     if config.kind == "auto":
         compared = _compare_at_held_back_points(map_only, start, target, objective, FOLDS if first else 1)
-        found, measured = compared.with_lamps, compared.evidence
+        fitted, measured = compared.with_lamps, compared.evidence
         if not measured.favours(chosen=lamps_if_undecided or lamps.count > 0):
             unknown.copy_(compared.without_lamps.log_radiance)
-            lamps.place(no_lamps, no_lamps)
+            lamps.switch_off()
             return measured
     else:
-        found = start.fit(target, objective)
-    unknown.copy_(found.log_radiance)
+        fitted = start.fit(target, objective)
+    unknown.copy_(fitted.log_radiance)
     reach = from_candidates.sources[0].mean(0)
-    merged = merge_lamps(places, found.intensity, reach, most=len(lamps.position))
+    merged = merge_lamps(places, fitted.intensity, reach, max_lamps=len(lamps.position))
     _settle(lamps, merged, map_only, points, objective)
     return measured
 
@@ -104,9 +104,9 @@ def _settle(
     map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
     settled = settle_lamps(merged, lamps.radius, map_light, points, objective)
     transport = map_only.transport.concatenate(points.from_lamps(settled.places, lamps.radius))
-    found = CarriedLight(MapAndLamps(unknown, settled.intensity), transport).fit(points.target, objective)
-    unknown.copy_(found.log_radiance)
-    lamps.place(settled.places.position, found.intensity, settled.places.axis)
+    fitted = CarriedLight(MapAndLamps(unknown, settled.intensity), transport).fit(points.target, objective)
+    unknown.copy_(fitted.log_radiance)
+    lamps.place(settled.places.position, fitted.intensity, settled.places.axis)
 
 
 def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> CarriedLight:
@@ -125,12 +125,12 @@ def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) 
 
 @dataclass(frozen=True)
 class _Compared:
-    """Two fits to all points but the last fold held back, and the evidence of all folds held back.
+    """Fits of the light without and with lamps, and their comparison.
 
     Attributes:
-        without_lamps: the last fit without lamps.
-        with_lamps: the last fit with lamps.
-        evidence: the comparison of the two at held-back points.
+        without_lamps: the fit without lamps while the last fold was held back.
+        with_lamps: the fit with lamps while the last fold was held back.
+        evidence: the comparison at the points of all folds that were held back.
     """
 
     without_lamps: MapAndLamps
@@ -141,20 +141,25 @@ class _Compared:
 def _compare_at_held_back_points(
     map_only: CarriedLight, with_lamps: CarriedLight, target: Target, objective: Objective, folds: int
 ) -> _Compared:
-    """Fit the light with and without lamps, with so many of the `FOLDS` folds held back in turn.
+    """Fit the light without and with lamps while each of the first `folds` folds is held back in turn.
 
-    Surfaces learn under the light that is chosen first and then confirm it, so the first decision uses all
-    folds.
+    The first decision uses all folds, because later ones are biased towards it: the base colour is learned
+    under the light that was chosen first, and then supports that light.
     """
     fold = _folds(target.position)
     gains = []
     for number in range(folds):
         held_back, fitted = fold == number, fold != number
-        plain = map_only[fitted].fit(target[fitted], objective)
-        found = with_lamps[fitted].fit(target[fitted], objective)
-        lights = (map_only[held_back].with_light(plain), with_lamps[held_back].with_light(found))
-        gains.append(error_reduction(*lights, target[held_back], objective))
-    return _Compared(plain, found, evidence(torch.cat(gains)))
+        without = map_only[fitted].fit(target[fitted], objective)
+        having = with_lamps[fitted].fit(target[fitted], objective)
+        gain = error_reduction(
+            map_only[held_back].with_light(without),
+            with_lamps[held_back].with_light(having),
+            target[held_back],
+            objective,
+        )
+        gains.append(gain)
+    return _Compared(without, having, evidence(torch.cat(gains)))
 
 
 def _folds(position: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:

@@ -205,8 +205,7 @@ class MapSolver(nn.Module):
         if lamps.count and measured is not None:
             in_views = judge(lamps, self.lobe, scene)
             if in_views.gain < -in_views.deviation:
-                none = lamps.position[:0]
-                lamps.place(none, none)
+                lamps.switch_off()
                 measured = in_views
         if lamps.count:
             environment.resample(trial.light.log_radiance)

@@ -11,7 +11,7 @@ from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig
 from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.plugin.model import FieldAdamConfig, NeilfMethodConfig
-from neilfpp_method.schedule import GEOMETRY, MATERIAL, stage_steps
+from neilfpp_method.schedule import GEOMETRY, MATERIAL, total_steps
 from neilfpp_method.settings.presets import fixed_geometry, preset
 from neilfpp_method.settings.types import NeilfConfig
 
@@ -23,7 +23,7 @@ def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
     loop = settings.train
     return TrainerConfig(
         method_name=name,
-        max_num_iterations=sum(stage_steps(loop).values()),
+        max_num_iterations=total_steps(loop),
         steps_per_save=loop.checkpoint_every,
         steps_per_eval_image=loop.checkpoint_every,
         pipeline=VanillaPipelineConfig(

@@ -36,7 +36,7 @@ from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.plugin.outputs import method_outputs
 from neilfpp_method.plugin.pictures import view_figures, view_pictures
 from neilfpp_method.plugin.record import RunRecord, no_record
-from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, stage_steps, weigh
+from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, total_steps, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
@@ -286,7 +286,7 @@ class NeilfMethod(Model):
 
     def _end_after_last(self, trainer: Trainer, step: int) -> None:
         """Stop after the last stage: nerfstudio counts iterations from the step at which it resumes."""
-        if step + 1 >= sum(stage_steps(self.config.neilf.train).values()):
+        if step + 1 >= total_steps(self.config.neilf.train):
             trainer.stop_training = True
 
     def update_to_step(self, step: int) -> None:

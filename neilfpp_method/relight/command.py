@@ -201,8 +201,8 @@ def _render(
 def _over_sky(picture: Picture, sky: Sky, shot: Shot) -> Picture:
     """Composite the image over the environment map."""
     height, width = picture.alpha.shape[:2]
-    seen = pixel_rays(shot.camera, torch.arange(height * width, device=picture.alpha.device))
-    background = (sky.lookup(seen.rays.directions) * seen.valid[:, None]).view(height, width, 3)
+    pixels = pixel_rays(shot.camera, torch.arange(height * width, device=picture.alpha.device))
+    background = (sky.lookup(pixels.rays.directions) * pixels.valid[:, None]).view(height, width, 3)
     radiance = picture.radiance + (1 - picture.alpha) * background
     return dataclasses.replace(picture, radiance=radiance, alpha=torch.ones_like(picture.alpha))
 

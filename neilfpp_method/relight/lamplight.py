@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.fields.lamps import Lamps, emission
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.shading.frame import local_frame, safe_normalize
 
@@ -103,13 +103,7 @@ class Lamplight:
         outside = offset.square().sum(-1) > self.radius**2
         hit = outside & (along > 0) & (miss < self.radius**2)
         distance = torch.where(hit, along - (self.radius**2 - miss).clamp_min(0).sqrt(), torch.inf)
-        return LampHits(distance, (hit * self._emission(wi, lamp))[:, None] * self.radiance[lamp])
-
-    def _emission(self, wi: Float[Tensor, "*B 3"], lamp: Int[Tensor, "*L"]) -> Float[Tensor, "*B"]:
-        """Emission of lamps towards the origin of rays, relative to that along the axis."""
-        axis = self.axis[lamp]
-        is_bulb = axis.square().sum(-1) == 0
-        return torch.where(is_bulb, 1.0, (-(wi * axis).sum(-1)).clamp_min(0))
+        return LampHits(distance, (hit * emission(wi, self.axis[lamp]))[:, None] * self.radiance[lamp])
 
     def _probabilities(self, x: Float[Tensor, "N 3"]) -> Float[Tensor, "N K"]:
         """Selection probability of each lamp at each point.
@@ -117,9 +111,8 @@ class Lamplight:
         It is proportional to luminance over squared distance, where a distance counts as at least the radius.
         """
         offset = self.position - x[:, None]
-        lamps = torch.arange(len(self.position), device=x.device)
-        emission = EVEN_SHARE + (1 - EVEN_SHARE) * self._emission(safe_normalize(offset), lamps)
-        weight = luminance(self.radiance) * emission / offset.square().sum(-1).clamp_min(self.radius**2)
+        share = EVEN_SHARE + (1 - EVEN_SHARE) * emission(safe_normalize(offset), self.axis)
+        weight = luminance(self.radiance) * share / offset.square().sum(-1).clamp_min(self.radius**2)
         return weight / weight.sum(-1, keepdim=True)
 
     def _one_minus_cosine(self, offset: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

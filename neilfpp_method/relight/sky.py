@@ -14,14 +14,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.fields.direction_map import cos_edges
+from neilfpp_method.fields.direction_map import cos_edges, texel_means
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.color import luminance
 
 __all__ = ["Sky", "SkySample", "sky_of_run"]
-
-MEAN_OF_CELL = (1 / 8, 3 / 4)
-"""Weights of each neighbour and of the texel itself, per axis, in the mean of bilinear radiance."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +64,17 @@ class Sky:
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
         """Sample directions from random numbers in [0, 1), in proportion to luminance times solid angle."""
         height, width = self.radiance.shape[:2]
-        by_row, by_texel = self._cumulated
+        by_texel = self._cumulated
+        by_row = by_texel[width - 1 :: width].contiguous()
         u = u.double()
         # The row first, then the column within it, which preserves the stratification of u.
-        row, down = _invert(by_row, u[:, 0] * by_row[-1], 0, height)
+        down = _invert(by_row, u[:, 0] * by_row[-1], 0, height)
+        row = down.index
         before = torch.where(row > 0, by_texel[(row * width - 1).clamp_min(0)], 0.0)
         mass = by_texel[row * width + width - 1] - before
-        texel, across = _invert(by_texel, before + u[:, 1] * mass, row * width, row * width + width)
-        cos_theta = torch.lerp(self._cos_edges[row], self._cos_edges[row + 1], down)
-        phi = self.start + 2 * math.pi * (texel - row * width + across) / width
+        across = _invert(by_texel, before + u[:, 1] * mass, row * width, row * width + width)
+        cos_theta = torch.lerp(self._cos_edges[row], self._cos_edges[row + 1], down.position)
+        phi = self.start + 2 * math.pi * (across.index - row * width + across.position) / width
         sine = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
         wi = torch.stack((phi.sin() * sine, phi.cos() * sine, cos_theta), -1).float()
         return SkySample(wi, self.pdf(wi))
@@ -110,21 +109,16 @@ class Sky:
     @cached_property
     def _mass(self) -> Float[Tensor, "H W"]:
         """Mean luminance of bilinear radiance over each texel, times its solid angle; float64."""
-        mean = luminance(self.radiance.double())
-        mean = MEAN_OF_CELL[0] * (mean.roll(1, 1) + mean.roll(-1, 1)) + MEAN_OF_CELL[1] * mean
-        above, below = torch.cat((mean[:1], mean[:-1])), torch.cat((mean[1:], mean[-1:]))
-        mean = MEAN_OF_CELL[0] * (above + below) + MEAN_OF_CELL[1] * mean
-        return mean * self._solid_angles[:, None]
+        return texel_means(luminance(self.radiance.double())) * self._solid_angles[:, None]
 
     @cached_property
     def _solid_angles(self) -> Float[Tensor, " H"]:
         return (self._cos_edges[:-1] - self._cos_edges[1:]) * 2 * math.pi / self.radiance.shape[1]
 
     @cached_property
-    def _cumulated(self) -> tuple[Float[Tensor, " H"], Float[Tensor, " T"]]:
-        """Cumulated masses of rows and texels; float64, because float32 cannot sum eight million texels."""
-        texels = self._mass.reshape(-1).cumsum(0)
-        return texels[self.radiance.shape[1] - 1 :: self.radiance.shape[1]].contiguous(), texels
+    def _cumulated(self) -> Float[Tensor, " T"]:
+        """Cumulated masses of the texels; float64, because float32 cannot sum eight million texels."""
+        return self._mass.reshape(-1).cumsum(0)
 
     @cached_property
     def _density(self) -> Float[Tensor, " T"]:
@@ -136,15 +130,23 @@ def sky_of_run(light: EnvironmentLight) -> Sky:
     return Sky(light.log_radiance.detach().exp().permute(1, 2, 0).contiguous(), rows_at_poles=True, start=0.0)
 
 
+@dataclass(frozen=True)
+class _Entry:
+    """The entries of a list that contain cumulated values, and the positions in them, from 0 to 1."""
+
+    index: Int[Tensor, " N"]
+    position: Float[Tensor, " N"]
+
+
 def _invert(
     cumulated: Float[Tensor, " K"],
     value: Float[Tensor, " N"],
     first: Int[Tensor, " N"] | int,
     end: Int[Tensor, " N"] | int,
-) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
-    """Find the entry among first … end − 1 that contains a cumulated value, and the position within it."""
+) -> _Entry:
+    """Find the entry among first … end − 1 that contains a cumulated value."""
     index = torch.searchsorted(cumulated, value, right=True)
     index = torch.minimum(torch.maximum(index, torch.as_tensor(first)), torch.as_tensor(end) - 1)
     before = torch.where(index > 0, cumulated[(index - 1).clamp_min(0)], 0.0)
     position = (value - before) / (cumulated[index] - before).clamp_min(torch.finfo(torch.float64).tiny)
-    return index, position.clamp(0, 1)
+    return _Entry(index, position.clamp(0, 1))

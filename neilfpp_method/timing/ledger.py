@@ -19,7 +19,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ContextDecorator, contextmanager
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 __all__ = ["EVERY", "PREPARATION", "WORK", "Ledger", "Work", "recording", "timed"]
 
@@ -62,6 +62,13 @@ FIRST = 10
 """On a GPU, the first sampled step of a stage. The steps before it compile and allocate."""
 
 
+class Mark(NamedTuple):
+    """A kind of work, and whether marks within it are ignored; see `timed`."""
+
+    work: Work
+    apart: bool
+
+
 class Ledger:
     """Counts seconds by stage and by kind of work, from its construction on.
 
@@ -79,8 +86,8 @@ class Ledger:
         self._unsampled: dict[str, float] = {}
         self._sampled: dict[str, dict[str, float]] = {}
         self._synchronize, self._now = synchronize, now
-        self._stage, self._work = PREPARATION, "rest"
-        self._in_step = self._apart = False
+        self._stage, self._mark = PREPARATION, Mark("rest", apart=False)
+        self._in_step = False
         self._samples = synchronize is None
         self._since = now()
 
@@ -129,24 +136,24 @@ class Ledger:
             self._count()
             self._in_step, self._samples = False, self._synchronize is None
 
-    def begin(self, work: Work, apart: bool) -> tuple[Work, bool]:
-        """Begin another kind of work; see `timed`. Returns the previous kind, for `restore`."""
-        before = self._work, self._apart
-        if not self._apart:
-            if apart or self._samples:
-                self._wait(always=apart)
+    def begin(self, mark: Mark) -> Mark:
+        """Begin another kind of work; see `timed`. Returns the mark of the previous one, for `restore`."""
+        before = self._mark
+        if not before.apart:
+            if mark.apart or self._samples:
+                self._wait(always=mark.apart)
                 self._count()
-            self._work, self._apart = work, apart
+            self._mark = mark
         return before
 
-    def restore(self, before: tuple[Work, bool]) -> None:
-        """Return to the kind of work that `begin` returned."""
-        if before == (self._work, self._apart):
+    def restore(self, before: Mark) -> None:
+        """Return to the kind of work whose mark `begin` returned."""
+        if before == self._mark:
             return
-        if self._apart or self._samples:
-            self._wait(always=self._apart)
+        if self._mark.apart or self._samples:
+            self._wait(always=self._mark.apart)
             self._count()
-        self._work, self._apart = before
+        self._mark = before
 
     def _wait(self, always: bool = False) -> None:
         if self._synchronize is not None and (always or self._samples):
@@ -156,15 +163,15 @@ class Ledger:
         """Attribute the time since the last call to the current kind of work."""
         now = self._now()
         passed, self._since = now - self._since, now
-        if self._in_step and not self._apart and not self._samples:
+        if self._in_step and not self._mark.apart and not self._samples:
             self._unsampled[self._stage] = self._unsampled.get(self._stage, 0.0) + passed
             return
         targets = [self._seconds]
-        if self._in_step and not self._apart and self._synchronize is not None:
+        if self._in_step and not self._mark.apart and self._synchronize is not None:
             targets.append(self._sampled)
         for seconds in targets:
             parts = seconds.setdefault(self._stage, {})
-            parts[self._work] = parts.get(self._work, 0.0) + passed
+            parts[self._mark.work] = parts.get(self._mark.work, 0.0) + passed
 
 
 _ledger: Ledger | None = None
@@ -181,6 +188,13 @@ def recording(ledger: Ledger) -> Iterator[Ledger]:
         _ledger = before
 
 
+class _Interrupted(NamedTuple):
+    """The work that a `timed` context interrupts, and the ledger that counts it."""
+
+    ledger: Ledger
+    mark: Mark
+
+
 class timed(ContextDecorator):
     """Mark the kind of work in a context, or in a decorated function, for the ledger that listens, if any.
 
@@ -191,13 +205,13 @@ class timed(ContextDecorator):
     """
 
     def __init__(self, work: Work, apart: bool = False) -> None:
-        self._kind = work, apart
-        self._before: list[tuple[Ledger, tuple[Work, bool]] | None] = []
+        self._mark = Mark(work, apart)
+        self._before: list[_Interrupted | None] = []
 
     def __enter__(self) -> None:
-        self._before.append(None if _ledger is None else (_ledger, _ledger.begin(*self._kind)))
+        self._before.append(None if _ledger is None else _Interrupted(_ledger, _ledger.begin(self._mark)))
 
     def __exit__(self, *_: object) -> None:
         before = self._before.pop()
         if before is not None:
-            before[0].restore(before[1])
+            before.ledger.restore(before.mark)

@@ -81,7 +81,7 @@ def _start_light(run: Training, step: int) -> None:
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         seed_stream(run.config.train.seed, Stream.LIGHT, step)
-        review = review_light(run.plan, model, run.pixels, step, _light_pixels(run))
+        review = review_light(run.plan, model, run.pixels, step, _max_light_pixels(run))
         decisions, first = review.decisions, review.first
         _report(run, decisions)
         if first is not None:
@@ -98,23 +98,23 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
 
     The first process does this for all.
     """
-    model, most = run.model, _light_pixels(run)
-    if most < MIN_PIXELS or not is_search_due(model, position):
+    model, max_pixels = run.model, _max_light_pixels(run)
+    if max_pixels < MIN_PIXELS or not is_search_due(model, position):
         return
     if run.fabric.is_global_zero:
         with timed("light_fits", apart=True):
             seed_stream(run.config.train.seed, Stream.SEARCH, step)
-            summary = improve_material(model, light_places(model, run.pixels, most))
+            summary = improve_material(model, light_places(model, run.pixels, max_pixels))
         if summary is not None:
             run.reporter.say(summary)
     if run.fabric.world_size > 1:
         model.brdf.load_state_dict(run.fabric.broadcast(model.brdf.state_dict()))
 
 
-def _light_pixels(run: Training) -> int:
+def _max_light_pixels(run: Training) -> int:
     """Maximum number of pixels for the search of the initial light; a budget may limit it."""
-    most = None if run.pace is None else run.pace.plan.light_pixels
-    return MAX_PIXELS if most is None else most
+    planned = None if run.pace is None else run.pace.plan.light_pixels
+    return MAX_PIXELS if planned is None else planned
 
 
 def _review_effects(run: Training, step: int, review: Review, stream: Stream) -> None:

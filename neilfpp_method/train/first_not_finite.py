@@ -76,24 +76,24 @@ class OriginsOfNotFinite(TorchDispatchMode):
 
         Returns None if the tensor is finite, or if its non-finite values come from outside of the context.
         """
-        return None if is_finite(value) else self._origins.get(_memory(value))
+        return None if is_finite(value) else self._origins.get(_storage(value))
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        broken = [_memory(value) for value in _tensors((args, kwargs)) if not is_finite(value)]
-        sources = [self._origins[memory] for memory in broken if memory in self._origins]
+        bad_inputs = [_storage(value) for value in _tensors((args, kwargs)) if not is_finite(value)]
+        origins = [self._origins[storage] for storage in bad_inputs if storage in self._origins]
         result = func(*args, **(kwargs or {}))
         uninitialized = func.__name__.startswith(UNINITIALIZED)
         for value in _tensors(result):
             if uninitialized:
-                self._origins.pop(_memory(value), None)
+                self._origins.pop(_storage(value), None)
             elif is_finite(value):
                 continue
-            elif sources:
-                self._origins[_memory(value)] = min(sources, key=lambda origin: origin.order)
-            elif not broken:
-                # If an input was not finite but has no known origin, the value comes from outside of the
-                # context or from a compiled loop, which is not a torch operation.
-                self._origins[_memory(value)] = _origin(self._count, func, value)
+            elif origins:
+                self._origins[_storage(value)] = min(origins, key=lambda origin: origin.order)
+            elif not bad_inputs:
+                # A bad input without a known origin comes from outside of the context, or from a compiled
+                # loop, which is not a torch operation. Then this operation is not the origin either.
+                self._origins[_storage(value)] = _origin(self._count, func, value)
                 self._count += 1
         return result
 
@@ -107,19 +107,20 @@ def _tensors(nest: Any) -> Iterator[Tensor]:
     return (leaf for leaf in tree_leaves(nest) if isinstance(leaf, Tensor))
 
 
-def _memory(value: Tensor) -> StorageWeakRef:
-    """Key of a tensor: its storage, which views and the results of in-place operations share.
+def _storage(value: Tensor) -> StorageWeakRef:
+    """The storage of a tensor as a key; views of it and the results of in-place operations share it.
 
-    An address would not do. It is used again when a tensor is gone, and a compiled loop may write a NaN there
-    that does not come from the tensor before.
+    The address of the storage would be no key: a new tensor may get the address of one that has been freed,
+    and a NaN that a compiled loop writes there does not come from the origin of the old tensor.
     """
     return StorageWeakRef(value.untyped_storage())
 
 
 def _origin(order: int, func: Any, value: Tensor) -> Origin:
+    """Describe the current operation, whose result is `value`."""
     flat = value.detach().reshape(len(value) if value.ndim else 1, -1)
-    wrong = ~torch.isfinite(flat)
-    rows = tuple(torch.nonzero(wrong.any(1))[:, 0].tolist())
+    is_bad = ~torch.isfinite(flat)
+    rows = tuple(torch.nonzero(is_bad.any(1))[:, 0].tolist())
     node = torch._C._current_autograd_node()
     line = _line_of_forward(node) if node is not None else _line_here()
     return Origin(
@@ -128,7 +129,7 @@ def _origin(order: int, func: Any, value: Tensor) -> Origin:
         derivative_of=None if node is None else node.name(),
         place=line.place,
         code=line.code,
-        broken=int(wrong.sum()),
+        broken=int(is_bad.sum()),
         values=flat.numel(),
         rows=rows,
         length=len(flat),
@@ -137,14 +138,19 @@ def _origin(order: int, func: Any, value: Tensor) -> Origin:
 
 @dataclass(frozen=True)
 class _Line:
-    """A line of this package: file, number and function, and its source; None and empty if there is none."""
+    """A line of this package; without arguments, no line.
+
+    Attributes:
+        place: file, number and function.
+        code: source code.
+    """
 
     place: str | None = None
     code: str = ""
 
 
 def _line_here() -> _Line:
-    """The line of the innermost frame of this package on the call stack."""
+    """The line of the innermost frame of this package on the call stack; no line if there is none."""
     for frame in reversed(traceback.extract_stack()):
         path = Path(frame.filename)
         if path.is_relative_to(PACKAGE) and path != Path(__file__):
@@ -153,7 +159,7 @@ def _line_here() -> _Line:
 
 
 def _line_of_forward(node: Any) -> _Line:
-    """The line of the forward operation of an autograd node.
+    """The line of this package that called the forward operation of an autograd node; no line if none did.
 
     Torch's anomaly mode stores the traceback, as lines of the form `File "…", line 3, in f`.
     """

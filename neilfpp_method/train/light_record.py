@@ -37,10 +37,10 @@ class LightFit:
     lamps: int
 
 
-def note_fit(fits: list[LightFit], found: Evidence | None, lamps: int, step: int) -> None:
+def note_fit(fits: list[LightFit], evidence: Evidence | None, lamps: int, step: int) -> None:
     """Append the result of a fit to `fits` if it compared the light with and without lamps."""
-    if found is not None:
-        fits.append(LightFit(step, found.gain, found.deviation, found.points, lamps))
+    if evidence is not None:
+        fits.append(LightFit(step, evidence.gain, evidence.deviation, evidence.points, lamps))
 
 
 def write_fits(run: Path, fits: Sequence[LightFit]) -> None:

@@ -10,7 +10,7 @@ import dataclasses
 import math
 import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
 from neilfpp_method.hosts.base import HasSurfaceWidth
 from neilfpp_method.schedule import (
+    Stage,
     StagePosition,
     Total,
     active_losses,
@@ -29,7 +30,7 @@ from neilfpp_method.schedule import (
     weigh,
 )
 from neilfpp_method.settings.facts import RadianceUnits
-from neilfpp_method.structures import LossTerms
+from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.checkpoint import (
     LAST,
@@ -96,7 +97,7 @@ def train(run: Training) -> None:
 
 def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: StagePosition, step: int) -> int:
     """Train the remaining steps of a stage. Returns the number of steps trained so far in all stages."""
-    model, stage, settings = run.model, position.stage, run.config.train
+    model, stage = run.model, position.stage
     model.freeze_for(stage)
     # A data-parallel wrapper is made for each stage, because it fixes the set of trained parameters.
     wrapped = run.fabric.setup_module(model, move_to_device=False)
@@ -104,23 +105,10 @@ def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: Stag
     run.reporter.begin_stage(stage.value, position.step, position.length)
     started = time.perf_counter()
     before = run.seconds.get(stage.value, 0.0)
-    # Only the smoothness loss reads image gradients.
-    gradients = "smoothness" in active_losses(stage, model.config, model.stages)
     number, length = position.step, position.length
     while number < length:
-        with run.ledger.step(number):
-            seed_step(settings.seed, step, run.fabric.global_rank)
-            at = StagePosition(stage, number, length)
-            waiting = waiting_fields(model, run.config.optimizer, at)
-            set_rates(optimizer, run.config.optimizer, at, waiting)
-            with timed("data"):
-                batch = run.pixels.sample(settings.rays, gradients)
-            moment = Moment.before_step(model, batch, at, step)
-            computed = wrapped(batch, stage)
-            total = weigh(computed.terms, active_losses(stage, model.config, model.stages, at.share))
-            stop = _update(run, optimizer, computed.terms, total, moment)
-            observe_and_solve(run, computed, step)
-        run.watch.after_step(model.stages[stage], computed, step)
+        at = StagePosition(stage, number, length)
+        stop = _train_step(run, optimizer, wrapped, at, step)
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
         reached = StagePosition(stage, number, length)
@@ -130,11 +118,48 @@ def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: Stag
         if number == length:
             # `train` saves the end of a stage under its name, and a stop takes effect after that.
             break
-        if stop or step % settings.checkpoint_every == 0:
+        if stop or step % run.config.train.checkpoint_every == 0:
             _save(run, optimizer, step)
         if stop:
             raise Stopped(f"stopped after step {step}", f"continue with: {run.continue_with}")
     return step
+
+
+def _train_step(
+    run: Training,
+    optimizer: torch.optim.Optimizer,
+    wrapped: Callable[[PixelBatch, Stage], StepResult],
+    at: StagePosition,
+    step: int,
+) -> bool:
+    """Train one step, and fit the light if that is due.
+
+    Args:
+        run: the training.
+        optimizer: the optimizer of all fields.
+        wrapped: `NeilfModel.step`, by the data-parallel wrapper of the stage.
+        at: the stage, and the index of the step in it.
+        step: index of the step in all stages.
+
+    Returns:
+        Whether a stop has been requested.
+    """
+    model, settings = run.model, run.config.train
+    with run.ledger.step(at.step):
+        seed_step(settings.seed, step, run.fabric.global_rank)
+        waiting = waiting_fields(model, run.config.optimizer, at)
+        set_rates(optimizer, run.config.optimizer, at, waiting)
+        weights = active_losses(at.stage, model.config, model.stages, at.share)
+        with timed("data"):
+            # Only the smoothness loss reads image gradients.
+            batch = run.pixels.sample(settings.rays, gradients="smoothness" in weights)
+        moment = Moment.before_step(model, batch, at, step)
+        computed = wrapped(batch, at.stage)
+        total = weigh(computed.terms, weights)
+        stop = _update(run, optimizer, computed.terms, total, moment)
+        observe_and_solve(run, computed, step)
+    run.watch.after_step(model.stages[at.stage], computed, step)
+    return stop
 
 
 def _keep_pace(run: Training, position: StagePosition, step: int) -> int:

@@ -65,11 +65,12 @@ def rerun_step(run: Path, step: int) -> Rerun:
     load_weights(model, skipped.model, run)
     model.train().freeze_for(skipped.stage)
     torch.set_rng_state(skipped.random)
-    return _computed(model, skipped)
+    return _run_step(model, skipped)
 
 
-def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
-    inputs = tuple(_broken_inputs(model, skipped.batch))
+def _run_step(model: NeilfModel, skipped: SkippedStep) -> Rerun:
+    """Run a step with a model that has its weights, and report what in it is not finite."""
+    inputs = tuple(_inputs_not_finite(model, skipped.batch))
     weights = active_losses(skipped.stage, model.config, model.stages, skipped.share)
     # Anomaly mode stores with each derivative the source line of its forward operation.
     with anomaly_mode.set_detect_anomaly(True, check_nan=False), OriginsOfNotFinite() as origins:
@@ -78,18 +79,19 @@ def _computed(model: NeilfModel, skipped: SkippedStep) -> Rerun:
         if total.loss.requires_grad:
             total.loss.backward()
     losses = tuple(name for name, value in total.terms.items() if not math.isfinite(value.item()))
-    broken = {
+    bad_gradients = {
         name: [p.grad for p in parameters if p.grad is not None and not is_finite(p.grad)]
         for name, parameters in model.parameter_groups().items()
     }
-    gradients = tuple(name for name, found in broken.items() if found)
-    ends = [terms[name].values for name in losses] + [grad for found in broken.values() for grad in found]
-    origins_found = [origin for end in ends if (origin := origins.origin_of(end)) is not None]
-    first = min(origins_found, key=lambda origin: origin.order, default=None)
-    return Rerun(skipped, inputs, losses, gradients, first)
+    fields_not_finite = tuple(name for name, gradients in bad_gradients.items() if gradients)
+    results = [terms[name].values for name in losses]
+    results += [gradient for gradients in bad_gradients.values() for gradient in gradients]
+    known = [origin for result in results if (origin := origins.origin_of(result)) is not None]
+    first = min(known, key=lambda origin: origin.order, default=None)
+    return Rerun(skipped, inputs, losses, fields_not_finite, first)
 
 
-def _broken_inputs(model: NeilfModel, batch: PixelBatch) -> Iterator[str]:
+def _inputs_not_finite(model: NeilfModel, batch: PixelBatch) -> Iterator[str]:
     """Names of the parameters and parts of the batch that are not finite."""
     yield from (name for name, p in model.named_parameters() if not is_finite(p))
     yield from (f.name for f in fields(batch) if not is_finite(getattr(batch, f.name)))

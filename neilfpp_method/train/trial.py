@@ -205,27 +205,42 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     costs, times = {}, _StageTimes()
     for stage, steps in lengths.items():
         times = _measure_stage(setup, stage, limits.steps / len(lengths))
-        fit = _fit_seconds(setup, times.fits[-1:]) / _steps_per_fit(setup.config)
         searches = len(SEARCH_AT) * SEARCH_SHARE * search.seconds if stage is Stage.MATERIAL_INIT else 0.0
-        cost = StageCost(
-            steps,
-            step=sum(times.steps) / len(times.steps),
-            fit=fit + searches / steps,
-            end=times.picture + 2 * times.health_check,
-        )
+        cost = _cost_of_steps(setup, steps, times, searches)
         if stage in with_material:
             cost = replace(cost, start=surface + places)
         if with_material and stage is with_material[0]:
-            first_fit = _fit_seconds(setup, times.fits[:1])
-            # The search for the initial light ends with the solver's first fit. Without the search, the first
-            # fit is made within the stage.
-            if search.pixels:
-                cost = replace(cost, start=cost.start + (search.seconds + first_fit))
-            else:
-                cost = replace(cost, first_fit=first_fit)
+            cost = _with_first_light(cost, search, _fit_seconds(setup, times.fits[:1]))
         costs[stage.value] = cost
     report = REPORT * times.picture if work.report else 0.0
     return Trial(Costs(costs, report), places * len(with_material), search.pixels)
+
+
+def _cost_of_steps(setup: _Setup, steps: int, times: _StageTimes, searches: float) -> StageCost:
+    """The cost of the steps of a stage and of its end, without that of its start.
+
+    Args:
+        setup: the settings of the training and of the trial.
+        steps: number of steps of the stage.
+        times: the times that were measured in the stage.
+        searches: time of the searches for materials in the stage, in seconds.
+    """
+    fit = _fit_seconds(setup, times.fits[-1:]) / _steps_per_fit(setup.config)
+    return StageCost(
+        steps,
+        step=sum(times.steps) / len(times.steps),
+        fit=fit + searches / steps,
+        end=times.picture + 2 * times.health_check,
+    )
+
+
+def _with_first_light(cost: StageCost, search: _Search, first_fit: float) -> StageCost:
+    """Add the search for the initial light and the first fit to the cost of the first stage with material."""
+    if search.pixels:
+        # The search ends with the solver's first fit.
+        return replace(cost, start=cost.start + (search.seconds + first_fit))
+    # Without the search, the first fit is made within the stage.
+    return replace(cost, first_fit=first_fit)
 
 
 def _set_up(work: Workload) -> _Setup:

@@ -89,17 +89,17 @@ def trace_grid(
         origins: starts of the rays, inside the cube.
         directions: unit directions.
     """
-    least = HIT_CELLS * cell_size(grid, radius)
+    hit_distance = HIT_CELLS * cell_size(grid, radius)
     compiled = ray_tracer(origins.device.type)
     if compiled is None or grid.dtype.itemsize < 4:
-        return _trace_together(grid, radius, origins, directions, least)
+        return _trace_together(grid, radius, origins, directions, hit_distance)
     hits = GridHits(grid.new_empty(len(origins)), grid.new_empty(len(origins), dtype=torch.bool))
     compiled(
         grid,
         radius,
         origins.to(grid.dtype),
         directions.to(grid.dtype),
-        least,
+        hit_distance,
         STEPS,
         hits.distance,
         hits.hit,
@@ -112,7 +112,7 @@ def _trace_together(
     radius: float,
     origins: Float[Tensor, "P 3"],
     directions: Float[Tensor, "P 3"],
-    least: float,
+    hit_distance: float,
 ) -> GridHits:
     distance, hit = torch.zeros_like(origins[:, 0]), torch.zeros_like(origins[:, 0], dtype=torch.bool)
     gone = hit
@@ -120,6 +120,6 @@ def _trace_together(
         point = origins + distance[:, None] * directions
         clearance = look_up(grid, radius, point).to(distance.dtype)
         gone = gone | (point.abs().amax(-1) > radius)
-        hit = hit | ((clearance < least) & ~gone)
-        distance = distance + torch.where(hit | gone, 0.0, clearance.clamp_min(least))
+        hit = hit | ((clearance < hit_distance) & ~gone)
+        distance = distance + torch.where(hit | gone, 0.0, clearance.clamp_min(hit_distance))
     return GridHits(distance, hit)

@@ -155,7 +155,7 @@ def test_large_masks_are_read_small_with_cameras_to_match(tmp_path):
     mask = disc(camera, center=(0.2, 0.1, 0.0))
     write_png(tmp_path / "mask.png", np.where(mask, 255, 0).astype(np.uint8))
     view = View("0", 0, camera, tmp_path / "image.png", tmp_path / "mask.png")
-    (outline,) = read_outlines([view], longest=100)
+    (outline,) = read_outlines([view], max_side=100)
     assert outline.inside.shape == (100, 100)
     assert outline.inside.mean() == pytest.approx(mask.mean(), rel=0.02)
     assert sightings(

@@ -15,7 +15,7 @@ from neilfpp_method.shading import LOBES
 from tests.effects.balls import ball
 from tests.hosts.balls import BallHost, ball_rays
 from tests.scenes import sphere_model, tiny_config
-from tests.train.small_runs import solved_light
+from tests.train.small_runs import short_light_fits, solved_light
 
 COUNT, VIEWS = 200, 8
 
@@ -68,6 +68,7 @@ def test_clipped_pixels_are_left_out_and_display_values_become_linear():
     torch.testing.assert_close(kept, torch.full_like(kept, 0.2140), atol=1e-3, rtol=0)
 
 
+@short_light_fits()
 def test_an_attached_model_starts_from_an_initial_light_and_searches_materials(small_memory, caplog):
     """The map that it starts with is bright above."""
     config = solved_light(tiny_config())

@@ -20,7 +20,7 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import EXPOSURE_RATE
 from neilfpp_method.settings.types import NeilfConfig
 from tests.scenes import sphere_batch, sphere_model, tiny_config
-from tests.train.small_runs import solved_light
+from tests.train.small_runs import short_light_fits, solved_light
 
 
 def settings(effects: str) -> NeilfConfig:
@@ -32,6 +32,7 @@ def settings(effects: str) -> NeilfConfig:
 
 
 @pytest.mark.parametrize("lamps", [True, False])
+@short_light_fits()
 def test_without_lamps_there_is_one_fit_and_no_candidate(lamps, monkeypatch):
     model, sources = sphere_model(settings("all" if lamps else "all,-lamps")), []
     monkeypatch.setattr(fit, "fit_light", lambda *a: sources.append(a[1].sources.shape[2]) or fit_light(*a))

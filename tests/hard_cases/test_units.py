@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,19 +17,15 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import read_oriented_ply, write_oriented_ply
-from neilfpp_method.lighting import solver
-from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.training import Training
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import small_config, small_training, solved_light
+from tests.train.small_runs import short_light_fits, small_config, small_training, solved_light
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
 STEPS = 4
-FIT_STEPS = 5
-"""Steps of a light fit. More of them amplify the rounding of the shifted logarithms."""
 
 
 def settings(light: str) -> NeilfConfig:
@@ -58,8 +53,7 @@ def trained(folder: Path, light: str, radiance: float = 1.0, length: float = 1.0
         points = read_oriented_ply(cloud)
         write_oriented_ply(cloud, dataclasses.replace(points, position=points.position * length))
     run = small_training(root, folder / "run", settings(light))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solver, "Objective", partial(Objective, steps=FIT_STEPS))
+    with short_light_fits():
         train(run)
     assert run.skipped == 0
     run.model.eval()

@@ -127,17 +127,17 @@ def test_neighbouring_lamps_merge_with_their_joint_power():
     intensity = torch.tensor([[3.0, 3.0, 3.0], [1.0, 1.0, 1.0], [2.0, 0.0, 0.0], [0.01, 0.01, 0.01]])
     axis = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     places = LampPlaces(position, axis)
-    found = merge_lamps(places, intensity, torch.ones(4), most=4)
+    found = merge_lamps(places, intensity, torch.ones(4), max_lamps=4)
     torch.testing.assert_close(found.places.axis, axis[[0, 2]])
     torch.testing.assert_close(found.places.position, torch.tensor([[0.015, 0.0, 0.5], [0.8, 0.0, 0.5]]))
     torch.testing.assert_close(found.intensity, torch.tensor([[4.0, 4.0, 4.0], [2.0, 0.0, 0.0]]))
-    assert len(merge_lamps(places, intensity, torch.ones(4), most=1).intensity) == 1
-    assert len(merge_lamps(places, torch.zeros(4, 3), torch.ones(4), most=4).intensity) == 0
+    assert len(merge_lamps(places, intensity, torch.ones(4), max_lamps=1).intensity) == 1
+    assert len(merge_lamps(places, torch.zeros(4, 3), torch.ones(4), max_lamps=4).intensity) == 0
 
 
 def test_panels_back_to_back_become_a_bulb():
     axis = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    found = merge_lamps(LampPlaces(LAMP.expand(2, 3), axis), torch.ones(2, 3), torch.ones(2), most=4)
+    found = merge_lamps(LampPlaces(LAMP.expand(2, 3), axis), torch.ones(2, 3), torch.ones(2), max_lamps=4)
     torch.testing.assert_close(found.places.axis, torch.zeros(1, 3))
 
 

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
+import pytest
 import torch
 from lightning_fabric import Fabric
 from rich.console import Console
@@ -15,6 +19,8 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.health.watch import Watch
+from neilfpp_method.lighting import solver
+from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
@@ -23,6 +29,9 @@ from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.quality import Quality
 from neilfpp_method.train.training import Training
 from tests.scenes import tiny_config
+
+FIT_STEPS = 5
+"""Optimisation steps of a light fit in `short_light_fits`."""
 
 
 def small_config(**train) -> NeilfConfig:
@@ -53,6 +62,17 @@ def solved_light(config: NeilfConfig) -> NeilfConfig:
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
         inter_reflection=fast.inter_reflection,
     )
+
+
+@contextmanager
+def short_light_fits() -> Iterator[None]:
+    """Light fits with few steps, for tests of the training and of what follows it, not of the light.
+
+    Fits of the usual length take most of the time of a small training, and amplify rounding.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solver, "Objective", partial(Objective, steps=FIT_STEPS))
+        yield
 
 
 class Listener(Reporter):

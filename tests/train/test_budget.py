@@ -182,7 +182,7 @@ def test_without_time_for_the_initial_light_training_starts_from_an_even_one(tmp
     capture = make_capture(tmp_path / "many", views=9)
     training = small_training(capture, tmp_path / "run", solved_light(small_config(sdf_steps=0)))
     plan = Plan.begin(parse_effects("auto"), training.config)
-    review = review_light(plan, training.model, training.pixels, 0, most=0)
+    review = review_light(plan, training.model, training.pixels, 0, max_pixels=0)
     assert review.first is None
     assert {(decision.effect, decision.on) for decision in review.decisions} == {
         ("long-tails", True),

@@ -20,7 +20,7 @@ from neilfpp_method.train.checkpoint import checkpoint_path, last_checkpoint
 from neilfpp_method.train.light_record import LightFit, light_summary, read_fits, write_fits
 from neilfpp_method.train.run import load_run
 from tests.calls import refused, train_tiny
-from tests.train.small_runs import small_config
+from tests.train.small_runs import short_light_fits, small_config
 
 
 def mapped_config() -> NeilfConfig:
@@ -99,7 +99,8 @@ def test_a_stopped_run_continues_without_the_file(capture, sky, tmp_path):
     last_checkpoint(out).write_bytes(stage)
     checkpoint_path(out, "joint").unlink()
     sky.unlink()
-    assert main(["train", "--out", str(out), "--resume", "--device", "cpu"]) == 0
+    with short_light_fits():
+        assert main(["train", "--out", str(out), "--resume", "--device", "cpu"]) == 0
     torch.testing.assert_close(radiance_of(out), expected, rtol=0, atol=0)
     assert read_fits(out, before=10**9) == record  # no duplicates, and the same values
 

@@ -104,14 +104,14 @@ def _write_image(
 
 
 def _copy_mask(
-    mask: Path | None, camera: Camera, straight: Camera, target: Path, least: float
+    mask: Path | None, camera: Camera, straight: Camera, target: Path, threshold: float
 ) -> Path | None:
-    """Copy a mask; a resampled pixel is white if its interpolated value is above `least`."""
+    """Copy a mask; a resampled pixel is white if its interpolated value is above `threshold`."""
     if mask is None:
         return None
     if camera is straight and mask.suffix.lower() == ".png":
         return copy_file(mask, target)
     white = (read_image(mask).mask[..., None] > 0.5).astype(np.float32)
     moved = white if camera is straight else resample(white, camera, straight)
-    write_png(target, np.where(moved > least, 255, 0).astype(np.uint8))
+    write_png(target, np.where(moved > threshold, 255, 0).astype(np.uint8))
     return target

@@ -131,17 +131,31 @@ def read_scan(capture: Capture) -> ScanData:
     Raises:
         UserError: a file is missing, damaged, or too large.
     """
-    mask_file, plane_file, cloud_file = _files(capture)
-    mask = _matrices(mask_file, {"ObsMask": 3, "BB": 2, "Res": 2})
-    plane = _matrices(plane_file, {"P": 2})["P"].reshape(-1).astype(np.float64)
+    files = _files(capture)
+    mask = _matrices(files.mask, {"ObsMask": 3, "BB": 2, "Res": 2})
+    plane = _matrices(files.plane, {"P": 2})["P"].reshape(-1).astype(np.float64)
     box, cell = mask["BB"].astype(np.float64), mask["Res"].reshape(-1).astype(np.float64)
     shapes_fit = box.shape == (2, 3) and cell.shape == (1,) and plane.shape == (4,)
     if not shapes_fit or not np.isfinite([*box.flat, *cell, *plane]).all() or cell[0] <= 0:
-        raise UserError(f"{mask_file}: not an observation mask of DTU", "download the SampleSet again")
-    return ScanData(mask["ObsMask"], box[0], box[1], float(cell[0]), plane, _points(cloud_file))
+        raise UserError(f"{files.mask}: not an observation mask of DTU", "download the SampleSet again")
+    return ScanData(mask["ObsMask"], box[0], box[1], float(cell[0]), plane, _points(files.points))
 
 
-def _files(capture: Capture) -> tuple[Path, Path, Path]:
+@dataclass(frozen=True)
+class _Files:
+    """The files of the scanner's data of one scan, in the layout of the dataset's SampleSet."""
+
+    mask: Path
+    plane: Path
+    points: Path
+
+
+def _files(capture: Capture) -> _Files:
+    """The files for the scan of a capture.
+
+    Raises:
+        UserError: a file is missing, or the folder of the capture has no number.
+    """
     scans = re.findall(r"\d+", capture.root.resolve().name)
     if not scans:
         raise UserError(
@@ -150,23 +164,24 @@ def _files(capture: Capture) -> tuple[Path, Path, Path]:
             "name the folder scan24, for instance",
         )
     scan = int(scans[-1])
-    names = (
-        f"ObsMask/ObsMask{scan}_10.mat",
-        f"ObsMask/Plane{scan}.mat",
-        f"Points/stl/stl{scan:03d}_total.ply",
+    return _Files(
+        mask=_file(capture, f"ObsMask/ObsMask{scan}_10.mat"),
+        plane=_file(capture, f"ObsMask/Plane{scan}.mat"),
+        points=_file(capture, f"Points/stl/stl{scan:03d}_total.ply"),
     )
-    paths = []
-    parent = capture.root.resolve().parent
-    for name in names:
-        path = existing(parent, capture.root.resolve() / name, parent / name)
-        if path is None:
-            raise UserError(
-                f"{capture.root}: the protocol {NAME} needs the scanner's data, and {name} is neither in "
-                "this folder nor in its parent",
-                "put ObsMask and Points of the dataset's SampleSet there",
-            )
-        paths.append(path)
-    return paths[0], paths[1], paths[2]
+
+
+def _file(capture: Capture, name: str) -> Path:
+    """A file of the dataset, in the folder of the capture or in its parent."""
+    root = capture.root.resolve()
+    path = existing(root.parent, root / name, root.parent / name)
+    if path is None:
+        raise UserError(
+            f"{capture.root}: the protocol {NAME} needs the scanner's data, and {name} is neither in "
+            "this folder nor in its parent",
+            "put ObsMask and Points of the dataset's SampleSet there",
+        )
+    return path
 
 
 def _matrices(path: Path, wanted: Mapping[str, int]) -> dict[str, np.ndarray]:

@@ -45,6 +45,8 @@ from neilfpp_method.train.run import Run
 __all__ = ["SYNTHETIC4RELIGHT"]
 
 NAME = "synthetic4relight"
+ROUGHNESS_NAMES = ("rough", "roughness")
+"""Ends of the name of the file with the true roughness, the first that exists."""
 
 
 @dataclass(frozen=True)
@@ -64,18 +66,19 @@ class _True:
     alpha: Float[np.ndarray, "H W 1"]
 
 
-def _paths(view: View) -> tuple[Path, tuple[Path, Path]]:
-    stem = view.image.stem.removesuffix("_rgba")
-    albedo, rough, roughness = (
-        view.image.with_name(f"{stem}_{name}.png") for name in ("albedo", "rough", "roughness")
-    )
-    return albedo, (rough, roughness)
+def _true_path(view: View, name: str) -> Path:
+    """The file of a true map of a view, beside its image."""
+    return view.image.with_name(f"{view.image.stem.removesuffix('_rgba')}_{name}.png")
+
+
+def _roughness_path(capture: Capture, view: View) -> Path | None:
+    """The file of the true roughness, which has one of two names; None if there is none."""
+    return existing(capture.root, *(_true_path(view, name) for name in ROUGHNESS_NAMES))
 
 
 def _true(capture: Capture, view: View) -> _True:
-    place, places = _paths(view)
-    image, albedo = read_beside(view.image, view), read_beside(place, view)
-    rough = read_beside(existing(capture.root, *places) or places[0], view)
+    image, albedo = read_beside(view.image, view), read_beside(_true_path(view, "albedo"), view)
+    rough = read_beside(_roughness_path(capture, view) or _true_path(view, ROUGHNESS_NAMES[0]), view)
     albedo_alpha = alpha_of(albedo)
     linear = srgb_to_linear(torch.from_numpy(albedo.pixels * albedo_alpha)).numpy()
     return _True(linear, rough.pixels[..., :1] * alpha_of(rough), albedo_alpha, alpha_of(image))
@@ -86,11 +89,11 @@ def _check(run: Run) -> None:
     root = run.capture.root
     for view in run.capture.test_views:
         check_full_size(NAME, view)
-        albedo, rough = _paths(view)
+        albedo, roughness = _true_path(view, "albedo"), _true_path(view, ROUGHNESS_NAMES[0])
         if existing(root, albedo) is None:
             raise missing(NAME, run.capture, view, "true albedo", str(albedo.relative_to(root)))
-        if existing(root, *rough) is None:
-            raise missing(NAME, run.capture, view, "true roughness", str(rough[0].relative_to(root)))
+        if _roughness_path(run.capture, view) is None:
+            raise missing(NAME, run.capture, view, "true roughness", str(roughness.relative_to(root)))
 
 
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
