@@ -83,7 +83,8 @@ class AttachedNeilf(nn.Module):
         host, config, facts = model.host, model.config, model.facts
         traced = model.borrowed and config.inter_reflection.mode != "off"
         render = host.render if traced and answers_secondary_rays(_inner(host)) else None
-        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render)
+        near_too = proxy is None
+        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render, near_too)
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False

@@ -50,6 +50,8 @@ MAX_DISTANCE = 0.01
 """Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
 MAX_DISTANT_SHARE = 0.4
 """Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
+CLOSE = 0.05
+"""Distance from a hit at which rays start in the search for a near plane, as in `check_host`."""
 MAX_MEDIAN_RATIO = 30.0
 """Factor between the median of the pixels and `median_radiance` above which one of them is probably wrong."""
 
@@ -65,6 +67,8 @@ class FirstBatches:
         facts: meaning of pixel values, and median linear luminance of the object.
         render: renders any rays with the host, to compare its hits from two viewpoints; if None, they are not
             compared.
+        near_too: whether to compare them from close by as well, since the host itself renders rays that start
+            on its surface.
     """
 
     def __init__(
@@ -73,11 +77,13 @@ class FirstBatches:
         hit_share: float,
         facts: SceneFacts,
         render: Callable[[RayBatch], SurfaceHits] | None = None,
+        near_too: bool = False,
     ) -> None:
         self.name = name
         self.hit_share = hit_share
         self.facts = facts
         self.render = render
+        self.near_too = near_too
         self.batches = 0
         self.any_hit = False
         self._warned: set[str] = set()
@@ -227,10 +233,7 @@ class FirstBatches:
         distance = (position - batch.origins[rows]).norm(dim=-1, keepdim=True)
         tangent = normalize(torch.linalg.cross(hits.normal[rows], back.roll(1, dims=-1)), dim=-1)
         way = normalize(hits.normal[rows] + back + VIEWPOINT_TANGENT * tangent, dim=-1)
-        with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
-            again = render(RayBatch(position + distance * way, -way))
-        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < MAX_DISTANCE)
-        moved = 1.0 - same.float().mean().item()
+        moved = self._moved(position, way, distance, render)
         if moved > MAX_DISTANT_SHARE:
             self._warn(
                 "moved",
@@ -238,6 +241,25 @@ class FirstBatches:
                 "return distances along the unit ray, not z-depths; a host that is still being trained may "
                 "have no surface yet",
             )
+        elif self.near_too:
+            moved = self._moved(position, way, torch.full_like(distance, CLOSE), render)
+            if moved > MAX_DISTANT_SHARE:
+                self._warn(
+                    "near plane",
+                    f"{moved:.0%} of its hits are lost when seen from {CLOSE} away, and so is the light that "
+                    "surfaces close to each other exchange",
+                    "render rays that start on a surface without a near plane, or set inter_reflection.mode "
+                    "to 'hard', so that a proxy of the surface traces them (docs/hosts.md)",
+                )
+
+    def _moved(
+        self, position: Tensor, way: Tensor, distance: Tensor, render: Callable[[RayBatch], SurfaceHits]
+    ) -> float:
+        """The share of hits that are lost or elsewhere when they are rendered from a distance along `way`."""
+        with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
+            again = render(RayBatch(position + distance * way, -way))
+        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < MAX_DISTANCE)
+        return 1.0 - same.float().mean().item()
 
     def _warn(self, kind: str, problem: str, remedy: str) -> None:
         if kind not in self._warned:

@@ -10,11 +10,11 @@ import logging
 from collections.abc import Collection
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits, no_hits
+from neilfpp_method.hosts.answers import as_hits, given_depth, no_hits
 from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -131,7 +131,7 @@ class ForeignHost(nn.Module):
         Raises:
             UserError: it cannot be converted.
         """
-        return self._precise(rays, as_hits(self.inner, rays, rendered))
+        return self._precise(rays, as_hits(self.inner, rays, rendered), given_depth(rendered))
 
     def show_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
         """Add the camera rays of a training step to the proxy; the first call also explores the surface."""
@@ -147,14 +147,16 @@ class ForeignHost(nn.Module):
         rendered = self.inner.render_regularized(batch, names)
         return RegularizedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
-    def _precise(self, rays: RayBatch, hits: SurfaceHits) -> SurfaceHits:
-        if hits.position.dtype in COARSE and not self.warned_of_precision:
-            self.warned_of_precision = True
-            digits = torch.finfo(hits.position.dtype).eps
-            log.warning(
-                "%s: its position is %s, whose relative precision is %.0e; return positions in float32",
-                self.name,
-                hits.position.dtype,
-                digits,
-            )
+    def _precise(self, rays: RayBatch, hits: SurfaceHits, depth: Tensor | None) -> SurfaceHits:
+        for name, value in (("position", hits.position), ("depth", depth)):
+            if value is not None and value.dtype in COARSE and not self.warned_of_precision:
+                self.warned_of_precision = True
+                log.warning(
+                    "%s: its %s is %s, whose relative precision is %.0e; return %ss in float32",
+                    self.name,
+                    name,
+                    value.dtype,
+                    torch.finfo(value.dtype).eps,
+                    name,
+                )
         return hits.map(lambda t: t.to(rays.origins.dtype))
