@@ -86,7 +86,8 @@ class AttachedNeilf(nn.Module):
             model.borrowed and config.inter_reflection.mode != "off" and answers_secondary_rays(_inner(host))
         )
         render = host.render if renders_secondary_rays else None
-        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render)
+        near_too = proxy is None
+        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render, near_too)
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False

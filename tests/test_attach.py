@@ -275,6 +275,20 @@ def test_a_nerfstudio_model_is_recognized_by_its_attributes(monkeypatch):
     assert set(neilf.parameter_groups()) == {"brdf", "light"}  # it is trained by its own trainer
 
 
+def test_a_wrapper_that_hides_the_methods_of_a_host_is_refused():
+    """As a function it would call `forward`; around a plain function there is nothing to hide."""
+    with pytest.raises(UserError, match=r"DataParallel hides the methods of BallHost; attach .*host\.module"):
+        attach_neilf(nn.DataParallel(BallHost()), tiny_config())
+
+    class TrainedBall(Ball):
+        def parameter_groups(self):
+            return {"geometry": [self.radius]}
+
+    with pytest.raises(UserError, match="hides the methods of TrainedBall"):
+        attach_neilf(nn.DataParallel(TrainedBall()), tiny_config())
+    attach_neilf(nn.DataParallel(Ball()), tiny_config())
+
+
 def test_anything_but_a_host_is_refused_by_name():
     with pytest.raises(UserError, match="list is not a host; give an object with render"):
         attach_neilf([1, 2, 3])

@@ -315,6 +315,23 @@ def test_a_host_of_another_precision_is_converted_and_half_is_warned_about(dtype
     assert len(said) == (dtype != torch.float64)
 
 
+def test_a_depth_in_half_precision_is_warned_about_once(caplog):
+    """Positions are computed from it in single precision, and are as coarse as it is."""
+    ball = Ball()
+
+    def host(origins, directions):
+        color, position, normal = ball(origins, directions)
+        depth = (position - origins).norm(dim=-1)
+        return {"rgb": color.half(), "depth": depth.half(), "normal": normal.half()}
+
+    neilf = attach_neilf(host, tiny_config())
+    with caplog.at_level(logging.WARNING, "neilfpp_method.hosts"):
+        for _ in range(2):
+            neilf.losses(pixels(ball_rays(32)), "material_init")
+    (said,) = [record.message for record in caplog.records if "precision" in record.message]
+    assert "its depth is torch.float16, whose relative precision is 1e-03; return depths in float32" in said
+
+
 def test_rays_of_another_precision_are_refused():
     rays = ball_rays(4)
     batch = pixels(RayBatch(rays.origins.double(), rays.directions.double()))

@@ -27,11 +27,12 @@ def adapt(host: object, response: str) -> Host | ImageHost:
         response: meaning of its colours, if it is a nerfstudio model.
 
     Raises:
-        UserError: it has none of the forms of docs/hosts.md, or is called with other arguments.
+        UserError: it has none of the forms of docs/hosts.md, is called with other arguments, or is a wrapper
+            that hides the methods of a host.
     """
     if isinstance(host, type):
         raise UserError(f"{host.__name__} is a class, not a host", f"give an instance of {host.__name__}")
-    if isinstance(host, nn.Module) and hasattr(host, "get_outputs") and hasattr(host, "config"):
+    if _is_nerfstudio(host):
         from neilfpp_method.hosts.nerfstudio import NerfstudioHost
 
         return NerfstudioHost(host, response=response)
@@ -40,6 +41,7 @@ def adapt(host: object, response: str) -> Host | ImageHost:
         return host
     if isinstance(host, ImageHost):
         return host
+    _check_wrapper(host)
     if callable(host):
         adapted = CallableHost(host)
         called = host.forward if isinstance(host, nn.Module) else host
@@ -49,6 +51,27 @@ def adapt(host: object, response: str) -> Host | ImageHost:
         f"{type(host).__name__} is not a host",
         "give an object with render(rays) or render_image(camera), or a function of (origins, directions)",
     )
+
+
+def _is_nerfstudio(host: object) -> bool:
+    return isinstance(host, nn.Module) and hasattr(host, "get_outputs") and hasattr(host, "config")
+
+
+def _check_wrapper(host: object) -> None:
+    """Check that a host is no wrapper, as of data-parallel training, that hides the methods of a host.
+
+    Called as a function, it would be rendered by its `forward`, and never trained with the material.
+
+    Raises:
+        UserError: it is one.
+    """
+    inner = getattr(host, "module", None) if isinstance(host, nn.Module) else None
+    offers = isinstance(inner, Host | ImageHost | HasParameterGroups) or _is_nerfstudio(inner)
+    if isinstance(inner, nn.Module) and offers:
+        wrapper, wrapped = type(host).__name__, host_name(inner)
+        raise UserError(
+            f"{wrapper} hides the methods of {wrapped}", "attach the model inside: attach_neilf(host.module)"
+        )
 
 
 def _check_call(function: Callable[..., Any], name: str, what: str, count: int = 1) -> None:

@@ -34,7 +34,7 @@ from neilfpp_method.hosts.outputs import check_tensors, host_name
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
-__all__ = ["Rendered", "as_hits", "function_hits", "no_hits"]
+__all__ = ["Rendered", "as_hits", "function_hits", "given_depth", "no_hits"]
 
 Rendered = SurfaceHits | Mapping[str, Tensor] | Sequence[Tensor]
 """Rendered outputs of a host, in any form that this module reads."""
@@ -89,6 +89,18 @@ def function_hits(name: str, rays: RayBatch, answer: Any) -> SurfaceHits:
     position = torch.where(hit[:, None], position, rays.origins.to(position.dtype))
     share = hit.to(color.dtype)
     return SurfaceHits(color, position, torch.where(hit[:, None], normal, 0.0), share, share)
+
+
+def given_depth(rendered: Any) -> Tensor | None:
+    """The depths of rendered outputs by name; None if there are none, or none are read.
+
+    Positions are computed from them in the precision of the rays, so they show only here how coarse they are.
+    """
+    outputs = rendered._asdict() if _has_names(rendered) else rendered
+    if not isinstance(outputs, Mapping) or _optional(outputs, POSITION) is not None:
+        return None
+    depth = _optional(outputs, DEPTH)
+    return depth if isinstance(depth, Tensor) else None
 
 
 def no_hits(rays: RayBatch) -> SurfaceHits:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.other_viewpoints import other_viewpoints
+from neilfpp_method.hosts.other_viewpoints import OtherViewpoints, other_viewpoints
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import OrientedPoints, PixelBatch, RayBatch, SurfaceHits
@@ -48,6 +48,8 @@ MAX_DISTANCE = 0.01
 """Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
 MAX_DISTANT_SHARE = 0.4
 """Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
+CLOSE = 0.05
+"""Distance from a hit at which rays start in the search for a near plane, as in `check_host`."""
 MAX_MEDIAN_RATIO = 30.0
 """Factor between the median of the pixels and `median_radiance` above which one of them is probably wrong."""
 
@@ -63,6 +65,8 @@ class FirstBatches:
         facts: meaning of pixel values, and median linear luminance of the object.
         render: renders any rays with the host, to compare its hits from two viewpoints; if None, they are not
             compared.
+        near_too: whether to compare them from close by as well, since the host itself renders rays that start
+            on its surface.
     """
 
     def __init__(
@@ -71,11 +75,13 @@ class FirstBatches:
         hit_share: float,
         facts: SceneFacts,
         render: Callable[[RayBatch], SurfaceHits] | None = None,
+        near_too: bool = False,
     ) -> None:
         self.name = name
         self.hit_share = hit_share
         self.facts = facts
         self.render = render
+        self.near_too = near_too
         self.batches = 0
         self.any_hit = False
         self._warned: set[str] = set()
@@ -221,12 +227,8 @@ class FirstBatches:
         """
         rows = torch.nonzero(hit)[:, 0]
         rows = rows[:: math.ceil(len(rows) / MAX_REVIEWED_HITS)]
-        position = hits.position[rows]
-        others = other_viewpoints(batch.rays[rows], OrientedPoints(position, hits.normal[rows]))
-        with torch.random.fork_rng(devices=[position.device] if position.is_cuda else []):
-            again = render(others.rays(others.distance))
-        same = again.is_hit(self.hit_share) & ((again.position - position).norm(dim=-1) < MAX_DISTANCE)
-        moved = 1.0 - same.float().mean().item()
+        others = other_viewpoints(batch.rays[rows], OrientedPoints(hits.position[rows], hits.normal[rows]))
+        moved = self._moved(others, others.distance, render)
         if moved > MAX_DISTANT_SHARE:
             self._warn(
                 "moved",
@@ -234,6 +236,26 @@ class FirstBatches:
                 "return distances along the unit ray, not z-depths; a host that is still being trained may "
                 "have no surface yet",
             )
+        elif self.near_too:
+            moved = self._moved(others, torch.full_like(others.distance, CLOSE), render)
+            if moved > MAX_DISTANT_SHARE:
+                self._warn(
+                    "near plane",
+                    f"{moved:.0%} of its hits are lost when seen from {CLOSE} away, and so is the light that "
+                    "surfaces close to each other exchange",
+                    "render rays that start on a surface without a near plane, or set inter_reflection.mode "
+                    "to 'hard', so that a proxy of the surface traces them (docs/hosts.md)",
+                )
+
+    def _moved(
+        self, others: OtherViewpoints, distance: Tensor, render: Callable[[RayBatch], SurfaceHits]
+    ) -> float:
+        """The share of hits that are lost or elsewhere when they are rendered from these distances."""
+        with torch.random.fork_rng(devices=[distance.device] if distance.is_cuda else []):
+            again = render(others.rays(distance))
+        offset = (again.position - others.position).norm(dim=-1)
+        same = again.is_hit(self.hit_share) & (offset < MAX_DISTANCE)
+        return 1.0 - same.float().mean().item()
 
     def _warn(self, kind: str, problem: str, remedy: str) -> None:
         if kind not in self._warned:

@@ -10,12 +10,13 @@ import logging
 from collections.abc import Collection
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits, no_hits
+from neilfpp_method.hosts.answers import as_hits, given_depth, no_hits
 from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
+from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.settings.types import NeilfConfig
@@ -98,7 +99,7 @@ class ForeignHost(nn.Module):
             return self.proxy.render(rays)
         if not hasattr(self.inner, "render"):
             return self.camera_hits(rays)
-        return self.read(rays, self.inner.render(rays))
+        return self.read(rays, self._answer(rays))
 
     def camera_hits(self, rays: RayBatch) -> SurfaceHits:
         """Hits of camera rays by the host itself.
@@ -111,7 +112,7 @@ class ForeignHost(nn.Module):
                 f"{self.name} draws whole images, not rays",
                 "pass its hits: losses(batch, step, hits) and maps(rays, hits), see docs/hosts.md",
             )
-        return no_hits(rays) if len(rays) == 0 else self.read(rays, self.inner.render(rays))
+        return no_hits(rays) if len(rays) == 0 else self.read(rays, self._answer(rays))
 
     def image_hits(self, camera: Camera, rays: RayBatch) -> SurfaceHits:
         """The hits of all pixels of a camera, whose rays are given, by a host that draws whole images.
@@ -131,7 +132,7 @@ class ForeignHost(nn.Module):
         Raises:
             UserError: it cannot be converted.
         """
-        return self._precise(rays, as_hits(self.inner, rays, rendered))
+        return self._precise(rays, as_hits(self.inner, rays, rendered), given_depth(rendered))
 
     def show_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
         """Add the camera rays of a training step to the proxy; the first call also explores the surface."""
@@ -147,14 +148,20 @@ class ForeignHost(nn.Module):
         rendered = self.inner.render_regularized(batch, names)
         return RegularizedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
-    def _precise(self, rays: RayBatch, hits: SurfaceHits) -> SurfaceHits:
-        if hits.position.dtype in COARSE and not self.warned_of_precision:
-            self.warned_of_precision = True
-            digits = torch.finfo(hits.position.dtype).eps
-            log.warning(
-                "%s: its position is %s, whose relative precision is %.0e; return positions in float32",
-                self.name,
-                hits.position.dtype,
-                digits,
-            )
+    def _answer(self, rays: RayBatch) -> object:
+        """What the host returns; that of a function is not converted yet, so that its depths are seen."""
+        return self.inner.answer(rays) if isinstance(self.inner, CallableHost) else self.inner.render(rays)
+
+    def _precise(self, rays: RayBatch, hits: SurfaceHits, depth: Tensor | None) -> SurfaceHits:
+        for name, value in (("position", hits.position), ("depth", depth)):
+            if value is not None and value.dtype in COARSE and not self.warned_of_precision:
+                self.warned_of_precision = True
+                log.warning(
+                    "%s: its %s is %s, whose relative precision is %.0e; return %ss in float32",
+                    self.name,
+                    name,
+                    value.dtype,
+                    torch.finfo(value.dtype).eps,
+                    name,
+                )
         return hits.map(lambda t: t.to(rays.origins.dtype))

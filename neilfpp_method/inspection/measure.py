@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_linear
 
-__all__ = ["ViewFigures", "measure"]
+__all__ = ["ObjectSource", "ViewFigures", "measure"]
 
 THUMBNAIL_SIDE = 160
 """Longest side of the thumbnail of a view, in pixels."""
@@ -35,6 +36,9 @@ MIN_CLIPPED = 16
 """Smallest number of pixels at the maximum of a linear image that counts as clipping."""
 LEVEL_SAMPLES = 200_000
 """Number of pixels, up to a factor of two, from which the distinct levels are counted."""
+
+
+ObjectSource = Literal["mask file", "alpha channel", "background of one colour", "nothing"]
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class ViewFigures:
         pixels: number of the object's pixels that are valid.
         levels: number of distinct values among up to 400,000 pixels of the object, in the channel with the
             most.
+        object_from: what shows which pixels are the object; "nothing": all pixels count as the object.
         small: thumbnail in linear radiance, at most 160 pixels a side.
     """
 
@@ -74,6 +79,7 @@ class ViewFigures:
     broken: float = 0.0
     pixels: int = 0
     levels: int = 0
+    object_from: ObjectSource = "nothing"
     small: Float32[np.ndarray, "h w 3"] = field(
         default_factory=lambda: np.zeros((1, 1, 3), np.float32), repr=False
     )
@@ -85,16 +91,18 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         image = read_image(view.image)
         color = pixel_colors(view, image, hdr).numpy()
         valid = _mask(view, "valid", color.shape[:2])
-        mask = (
-            _mask(view, "mask", color.shape[:2])
-            if view.mask
-            else image.alpha is not None and image.alpha > 0.5
-        )
+        mask = _mask(view, "mask", color.shape[:2]) if view.mask else None
     except UserError as error:
         return ViewFigures(view.name, unreadable=error.problem)
     sound = (np.isfinite(color) & (color >= 0)).all(axis=-1)
     usable = sound & valid
-    chosen = usable & (_off_the_background(color, usable) if mask is False else mask)
+    source: ObjectSource = "mask file"
+    if mask is None and image.alpha is not None:
+        mask, source = image.alpha > 0.5, "alpha channel"
+    elif mask is None:
+        mask = _off_the_background(color, usable)
+        source = "nothing" if mask is None else "background of one colour"
+    chosen = usable if mask is None else usable & mask
     color = np.where(sound[..., None], color, np.float32(0.0))
     linear = color if hdr else srgb_to_linear(torch.from_numpy(color)).numpy()
     light = luminance(torch.from_numpy(linear)).numpy()
@@ -111,6 +119,7 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         broken=float((valid & ~sound).mean()),
         pixels=int(chosen.sum()),
         levels=_levels(color[chosen]),
+        object_from=source,
         small=_fitted(linear, THUMBNAIL_SIDE),
     )
 
@@ -127,16 +136,16 @@ def _mask(view: View, kind: str, size: tuple[int, int]) -> Bool[np.ndarray, "H W
 
 def _off_the_background(
     color: Float32[np.ndarray, "H W 3"], usable: Bool[np.ndarray, "H W"]
-) -> Bool[np.ndarray, "H W"]:
-    """Pixels that do not have the colour of most border pixels; all pixels if there is no such colour."""
+) -> Bool[np.ndarray, "H W"] | None:
+    """Pixels that do not have the colour of most border pixels; None if there is no such colour."""
     edge = np.zeros(usable.shape, bool)
     edge[[0, -1]] = edge[:, [0, -1]] = True
     border = color[edge & usable]
     if not len(border):
-        return usable
+        return None
     common = np.median(border, axis=0)
     even = (border == common).all(axis=-1).mean() >= BORDER_SHARE
-    return ~(color == common).all(axis=-1) if even else np.ones(usable.shape, bool)
+    return ~(color == common).all(axis=-1) if even else None
 
 
 def _sharpness(light: Float32[np.ndarray, "H W"], chosen: Bool[np.ndarray, "H W"], typical: float) -> float:

@@ -16,6 +16,7 @@ from neilfpp_method.hosts.first_batches import BATCHES
 from neilfpp_method.structures import RayBatch
 from tests.hosts.balls import Ball, BallHost, ball_rays
 from tests.scenes import tiny_config
+from tests.train.small_runs import solved_light
 
 SAYS = "neilfpp_method.hosts.first_batches"
 
@@ -117,6 +118,29 @@ def test_z_depth_is_warned_about_once(caplog):
             neilf.losses(batch(rays), "material_init")
     (record,) = (record for record in caplog.records if record.name == SAYS)
     assert said in record.message
+
+
+def near_plane(rays: RayBatch, outputs: dict) -> dict:
+    depth = (outputs["position"] - rays.origins).norm(dim=-1)
+    seen = outputs["concentration"] * (depth > 0.2)
+    return {"opacity": seen, "concentration": seen}
+
+
+def test_a_near_plane_is_warned_about_if_the_host_renders_rays_between_surfaces(caplog):
+    hosts = {"near": BallHost(near_plane), "true": BallHost(), "proxy": BallHost(near_plane)}
+    settings = {"near": tiny_config(), "true": tiny_config(), "proxy": solved_light(tiny_config())}
+    said = {}
+    for kind, host in hosts.items():
+        neilf = attach_neilf(host, settings[kind])
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, SAYS):
+            for seed in range(2):
+                neilf.losses(batch(ball_rays(64, seed=seed)), "material_init")
+        said[kind] = [record.message for record in caplog.records if "near plane" in record.message]
+    assert said["true"] == said["proxy"] == []
+    (message,) = said["near"]
+    assert "100% of its hits are lost when seen from 0.05 away" in message
+    assert "set inter_reflection.mode to 'hard'" in message
 
 
 def test_the_check_from_another_viewpoint_keeps_the_random_state():

@@ -223,6 +223,27 @@ def test_the_command_prints_and_writes_the_defects(capture: Capture, tmp_path: P
     assert (picture == (200, 40, 40)).all(-1).any(), "the flagged view is red"
 
 
+@pytest.mark.parametrize("unmarked", [0, 2])
+def test_the_command_says_what_shows_the_object(tmp_path: Path, capfd, unmarked: int) -> None:
+    """Without mask files the alpha channel is the mask, also if only some images have one."""
+    root = make_capture(tmp_path, views=6, hdr=False, masks=True, background=0.2)
+    for path in sorted((root / "inputs" / "masks").iterdir())[unmarked:]:
+        image = Image.open(root / "inputs" / "images" / path.name).convert("RGB")
+        image.putalpha(Image.open(path).convert("L"))
+        image.save(root / "inputs" / "images" / path.name)
+    assert main(["inspect", str(root)]) == 0
+    assert "object: shown by the mask file\n" in capfd.readouterr().out
+    shutil.rmtree(root / "inputs" / "masks")
+    assert main(["inspect", str(root), "--out", str(tmp_path / "out")]) == 0
+    said = "object: shown by the alpha channel"
+    if unmarked:
+        said = "object: shown by the background of one colour in 2 of 6 views and the alpha channel in 4 of 6"
+    assert said in capfd.readouterr().out
+    written = json.loads((tmp_path / "out" / "inspect.json").read_text())["views"]
+    sources = [view["object_from"] for view in written]
+    assert sources == ["background of one colour"] * unmarked + ["alpha channel"] * (6 - unmarked)
+
+
 def test_with_strict_a_problem_gives_status_1(capture: Capture, tmp_path: Path, capfd) -> None:
     assert main(["inspect", str(capture.root), "--strict"]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["scene"], "nothing is written without --out"

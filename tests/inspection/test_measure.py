@@ -102,7 +102,9 @@ def test_masks_and_broken_pixels(view: View, tmp_path: Path) -> None:
     assert (measured.broken, measured.invalid) == (0, pytest.approx(0.1))
     cut = np.concatenate([NOISE, np.zeros((HEIGHT, WIDTH, 1))], axis=2)
     cut[10:20, 10:20, 3] = 1
-    assert figures(view, cut).pixels == 100
+    measured = figures(view, cut)
+    assert (measured.pixels, measured.object_from) == (100, "alpha channel")
+    assert figures(view, NOISE).object_from == "nothing"
 
 
 def test_unreadable_views_are_reported(view: View, tmp_path: Path) -> None:
