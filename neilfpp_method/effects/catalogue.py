@@ -30,6 +30,8 @@ class Effect:
         advised: whether evidence is reported but never changes the effect, because it cannot show reliably
             that the effect is not needed.
         needs: name of the effect that this one requires; empty if it requires none.
+        earned: whether the effect is on only if its benefit is significant; other effects are off only if a
+            missing benefit is significant.
         solved: whether the light solver decides the effect at every fit, so that evidence changes no
             setting.
     """
@@ -45,6 +47,7 @@ class Effect:
     not_measured: Callable[[NeilfConfig], str] = lambda config: ""
     solved: bool = False
     advised: bool = False
+    earned: bool = False
     needs: str = ""
 
 
@@ -182,6 +185,7 @@ EFFECTS: Mapping[str, Effect] = {
             risk="metal becomes a dark glossy dielectric",
             not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
+            earned=True,
         ),
         Effect(
             name="varying-roughness",

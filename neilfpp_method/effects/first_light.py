@@ -94,8 +94,7 @@ class FirstLight:
 
     def summary(self) -> str:
         """One line for the console."""
-        ends = self.errors[SCALES[0]], self.errors[SCALES[-1]]
-        bounded = min(self.errors.values()) < min(ends)
+        bounded = SCALES[0] < self.scale < SCALES[-1]
         caution = "" if bounded else " (at the end of the range that was tried)"
         return f"initial light: fitted at {self.places} places; mean base colour {self.scale:.2f}{caution}"
 

@@ -31,7 +31,7 @@ WORTH = 0.0
 """Threshold for the reduction of the relative error. Metals take no additional time, so they are left out
 only if they increase the error.
 """
-WORTH_IN_DISPLAY_VALUES = 0.04
+WORTH_IN_DISPLAY_VALUES = 0.035
 """The same for images with display values. Three captures of photographs without metal had reductions of 1.5
 to 2.3 %; an object of which a third is metal had 5 % after a tone curve (docs/effects.md).
 """

@@ -149,7 +149,7 @@ class Plan:
             step: number of steps trained so far.
         """
         before = self.is_on(name)
-        favoured = measured.favours(before)
+        favoured = measured.favours(before and not EFFECTS[name].earned)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
         reason = f"{measured.summary()}; shown as advice only" if advised else measured.summary()

@@ -284,3 +284,11 @@ def test_a_free_light_has_no_lamps_to_switch():
 def test_a_bad_name_ends_the_command(tmp_path, capsys):
     assert main(["train", "--data", str(tmp_path), "--effects", "auto,-lamp"]) == 2
     assert "did you mean 'lamps'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("value", "on"), [(0.001, True), (0.0004, False), (-0.0001, False)])
+def test_metals_have_to_be_earned(value, on):
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
+    gain = Measurement("error", value, 0.0003, 0.0, 400)
+    assert plan.decide("metals", gain, 5).on is on
+    assert plan.decide("long-tails", gain, 5).on, "it stays on unless it is significantly worse"
