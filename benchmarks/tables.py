@@ -32,7 +32,15 @@ __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "wr
 
 ROOT = Path(__file__).parent.parent
 RESULTS = Path(__file__).parent / "results"
-NAMES = ("results.md", "performance.md", "budget.md", "confidence.md", "hosts.md", "relighting.md")
+NAMES = (
+    "results.md",
+    "performance.md",
+    "budget.md",
+    "confidence.md",
+    "effects.md",
+    "hosts.md",
+    "relighting.md",
+)
 DOCUMENTS = tuple(ROOT / "docs" / name for name in NAMES)
 FORMAT = 1
 MARKED = re.compile(r"(<!-- table: ([\w-]+)((?: \w+)*) -->\n).*?(<!-- end -->)", re.DOTALL)
