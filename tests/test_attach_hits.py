@@ -328,7 +328,7 @@ def test_a_depth_in_half_precision_is_warned_about_once(caplog):
     with caplog.at_level(logging.WARNING, "neilfpp_method.hosts"):
         for _ in range(2):
             neilf.losses(pixels(ball_rays(32)), "material_init")
-    (said,) = [record.message for record in caplog.records if "precision" in record.message]
+    (said,) = [record.message for record in caplog.records if "relative precision" in record.message]
     assert "its depth is torch.float16, whose relative precision is 1e-03; return depths in float32" in said
 
 
