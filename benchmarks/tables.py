@@ -39,6 +39,7 @@ NAMES = (
     "confidence.md",
     "effects.md",
     "hosts.md",
+    "light.md",
     "relighting.md",
 )
 DOCUMENTS = tuple(ROOT / "docs" / name for name in NAMES)
