@@ -269,8 +269,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "lamps fall off with the distance, not with its square",
         "fields/lamps.py",
-        "math.pi * radius**2 / distance.square(), _emission",
-        "math.pi * radius**2 / distance, _emission",
+        "math.pi * radius**2 / distance.square(), emission",
+        "math.pi * radius**2 / distance, emission",
         "fields/test_lamps.py",
     ),
     Mutant(
