@@ -29,9 +29,9 @@ class Effect:
         not_measured: function of the settings: the reason why no evidence is collected; empty if it is.
         advised: whether evidence is reported but never changes the effect, because it cannot show reliably
             that the effect is not needed.
+        earned: whether the effect needs a significant benefit to be on. Other effects stay on unless their
+            benefit is significantly below the threshold.
         needs: name of the effect that this one requires; empty if it requires none.
-        earned: whether the effect is on only if its benefit is significant; other effects are off only if a
-            missing benefit is significant.
         solved: whether the light solver decides the effect at every fit, so that evidence changes no
             setting.
     """

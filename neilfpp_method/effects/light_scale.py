@@ -28,8 +28,8 @@ SCALES = (0.1, 0.15, 0.22, 0.33, 0.5, 0.7)
 METAL_REFLECTANCE = 0.7
 """Typical base colour of a metal, mean of the channels: iron has 0.57, gold 0.71, silver 0.95."""
 MIN_METAL_SHARE = 0.5
-"""Minimum share of places that are metal for a scale by the reflectance of metals. If there are fewer, the
-reflection of the dielectrics reveals the scale.
+"""Minimum share of metal among the places for the reflectance of metals to select the scale. With less metal,
+the reflection of the dielectrics reveals the scale.
 """
 
 

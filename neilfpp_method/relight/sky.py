@@ -64,8 +64,7 @@ class Sky:
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
         """Sample directions from random numbers in [0, 1), in proportion to luminance times solid angle."""
         height, width = self.radiance.shape[:2]
-        by_texel = self._cumulated
-        by_row = by_texel[width - 1 :: width].contiguous()
+        by_row, by_texel = self._cumulated_rows, self._cumulated
         u = u.double()
         # The row first, then the column within it, which preserves the stratification of u.
         down = _invert(by_row, u[:, 0] * by_row[-1], 0, height)
@@ -119,6 +118,12 @@ class Sky:
     def _cumulated(self) -> Float[Tensor, " T"]:
         """Cumulated masses of the texels; float64, because float32 cannot sum eight million texels."""
         return self._mass.reshape(-1).cumsum(0)
+
+    @cached_property
+    def _cumulated_rows(self) -> Float[Tensor, " H"]:
+        """Cumulated masses of the rows: the values of `_cumulated` at the last texel of each row."""
+        width = self.radiance.shape[1]
+        return self._cumulated[width - 1 :: width].contiguous()
 
     @cached_property
     def _density(self) -> Float[Tensor, " T"]:
