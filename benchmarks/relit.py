@@ -2,9 +2,11 @@
 
     python -m benchmarks.relit --capture DATA/tabletop_env --under DATA/tabletop_relight
     python -m benchmarks.relit --capture DATA/tabletop_env --under DATA/tabletop_relight --runs RUN --exchange
+    python -m benchmarks.relit --capture DATA/spot_city --under DATA/spot_city/relit_forest --lobe ggx
 
 The rows are means over the test views: for the photograph of the view as it is; for the true surface with
-the true material, which has only the error and noise of the path tracer; and for each run. `--exchange` adds
+the true material, which has only the error and noise of the path tracer, if `--lobe` is that of the images;
+and for each run. `--exchange` adds
 two rows per run that show the cause of its error: its roughness and metallic with the true base colour, and
 its base colour with the true roughness and metallic. The figures are those of `neilfpp relight --truth`.
 `--save NAME` writes them for docs/relighting.md.
@@ -17,6 +19,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
@@ -44,7 +47,7 @@ from neilfpp_method.relight.recovered import check_material, surface_of_run
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.shading.brdf import SPHERICAL_GAUSSIAN
+from neilfpp_method.shading.brdf import LOBES
 from neilfpp_method.structures import Material
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.run import Run, load_run
@@ -65,6 +68,8 @@ class Options:
     """The test views under another light: envmap.exr and images/."""
     runs: tuple[Path, ...] = ()
     """Runs on this capture."""
+    lobe: Literal["spherical_gaussian", "ggx"] = "spherical_gaussian"
+    """Specular lobe with which the true images were rendered, for the true material."""
     exchange: bool = False
     """Also measure each run with the true base colour, and with the true roughness and metallic."""
     spp: int = 64
@@ -123,7 +128,7 @@ def true_surface(capture: Capture) -> Surface:
 def scenes(options: Options, capture: Capture) -> Iterator[tuple[str, Scene]]:
     """The rendered scenes by the names of the rows; a run is read when it is needed."""
     sky, materials = read_map(options.under / "envmap.exr", "ours").sky, true_materials(capture)
-    yield "true material", Scene(true_surface(capture), materials, SPHERICAL_GAUSSIAN, sky)
+    yield "true material", Scene(true_surface(capture), materials, LOBES[options.lobe], sky)
     for path in options.runs:
         run = load_run(path, pick_device("cpu"))
         check_material(run)
