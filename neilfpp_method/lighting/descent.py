@@ -44,8 +44,7 @@ def descend(
 
     Every point has a gain per channel; if the base colours are known, all points share it. The mean
     logarithm of the gains is `objective.log_scale`, because the pixels of the points hardly determine
-    the common scale of light and base colour. If the cameras have seen part of the light directly, that fixes
-    the scale, and the mean is free.
+    the common scale of light and base colour.
 
     Args:
         unknowns: the tensors to optimise, in place.
@@ -66,9 +65,8 @@ def descend(
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
-            gain = (
-                log_gain - log_gain.mean() + objective.log_scale if objective.sky is None else log_gain
-            ).exp()
+            scale = objective.log_scale
+            gain = (log_gain if scale is None else log_gain - log_gain.mean() + scale).exp()
             loss = loss_of(gain)
             if nearest is not None:
                 loss = loss + EVENNESS * unevenness(base_color * gain, nearest)

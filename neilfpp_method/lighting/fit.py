@@ -203,7 +203,7 @@ def error_reduction(
         target: these points and their pixels.
         objective: defines the relative error.
     """
-    gain = math.exp(objective.log_scale)
+    gain = math.exp(objective.log_scale or 0.0)
 
     def error(carried: CarriedLight) -> Float[Tensor, " N"]:
         strength = carried.light.strength()

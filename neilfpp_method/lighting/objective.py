@@ -102,6 +102,7 @@ class Objective:
         sky: what cameras saw of the map directly; None if they saw nothing of it.
         monochrome: whether the map has one channel for all three colours.
         log_scale: mean logarithm of the factors that a fit applies to the base colours; 0 keeps their scale.
+            None if it is free, because cameras saw enough of the map to fix the scale.
     """
 
     response: str
@@ -110,7 +111,7 @@ class Objective:
     base_color_known: bool = False
     sky: KnownSky | None = None
     monochrome: bool = False
-    log_scale: float = 0.0
+    log_scale: float | None = 0.0
 
     def relative_error(
         self,

@@ -246,8 +246,7 @@ class MapSolver(nn.Module):
             self.unit,
             sky=sky,
             monochrome=self.config.monochrome,
-            # If cameras saw the light directly, their pixels fix the scale.
-            log_scale=self._log_scale(material) if sky is None else 0.0,
+            log_scale=None if sky is not None and sky.fixes_scale else self._log_scale(material),
         )
         points, config = FitPoints(observed, material, self.lobe, scene), self.config
         if self.lamps_rejected and config.kind == "auto":

@@ -39,3 +39,9 @@ def patches(position: torch.Tensor) -> Material:
     speckled = material(len(position))
     octant = ((position > position.mean(0)) * torch.tensor([1, 2, 4])).sum(-1)
     return Material(speckled.base_color[octant], speckled.roughness, speckled.metallic)
+
+
+def looks(count: int, below: float = 1.0) -> torch.Tensor:
+    """Viewing directions of cameras; none of them above a given height."""
+    wi = normalize(torch.randn(8 * count, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    return wi[wi[:, 2] <= below][:count]

@@ -7,7 +7,6 @@ import math
 
 import pytest
 import torch
-from torch.nn.functional import normalize
 
 from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -16,7 +15,7 @@ from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.sky import HALF_WEIGHT_SPREAD, SkySightings
 from neilfpp_method.shading.color import linear_to_srgb
-from tests.lighting.surfaces import material, points
+from tests.lighting.surfaces import looks, material, points
 
 HEIGHT = 12
 
@@ -25,12 +24,6 @@ def gradient(wi: torch.Tensor) -> torch.Tensor:
     """A sky that is bright above and bluish below, and varies smoothly."""
     height = wi[..., 2:]
     return (0.3 + 0.2 * height) * torch.tensor([1.0, 1.1, 1.3]) - 0.1 * height * torch.tensor([0.0, 0.0, 1.0])
-
-
-def looks(count: int, below: float = 1.0) -> torch.Tensor:
-    """Viewing directions of cameras; none of them above a given height."""
-    wi = normalize(torch.randn(8 * count, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    return wi[wi[:, 2] <= below][:count]
 
 
 @pytest.mark.parametrize("response", ["linear", "srgb"])
@@ -93,7 +86,9 @@ def test_a_fit_keeps_observed_texels_and_estimates_the_others():
 
     def error(known: SkySightings | None) -> torch.Tensor:
         unit = image.median().item()
-        objective = Objective("linear", unit, steps=300, sky=known and known.known())
+        seen_sky = known and known.known()
+        log_scale = None if seen_sky and seen_sky.fixes_scale else 0.0
+        objective = Objective("linear", unit, steps=300, sky=seen_sky, log_scale=log_scale)
         start = MapAndLamps(torch.full((3, HEIGHT, 2 * HEIGHT), math.log(0.5)), torch.zeros(0, 3))
         found = fit_light(start, carried, Target(seen.position, wrong, image), objective)
         return (found.log_radiance - truth.log()).abs().mean(0)
