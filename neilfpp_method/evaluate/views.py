@@ -59,13 +59,13 @@ def render_view(
     each. If the run has no material yet, `rgb` is the host's colour, and the maps of the material are 0.
     """
     view = run.capture.views[view_index]
-    device = run.device
+    device, render = run.device, run.model.maps if run.has_material else run.model.host_maps
     rays = camera_rays(run.capture.scene_camera(view))
     parts = -(-len(rays) // EVAL_RAYS)
     combined: dict[str, Tensor] = {}
     for k in range(parts):
         rows = torch.arange(k, len(rays), parts)
-        maps = run.model.maps(rays[rows].to(device), run.has_material)
+        maps = render(rays[rows].to(device))
         for name in (f.name for f in fields(Maps)):
             values = getattr(maps, name).float().cpu()
             combined.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values

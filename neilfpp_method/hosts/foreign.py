@@ -134,7 +134,7 @@ class ForeignHost(nn.Module):
         """
         return self._precise(rays, as_hits(self.inner, rays, rendered), given_depth(rendered))
 
-    def show_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
+    def update_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
         """Add the camera rays of a training step to the proxy; the first call also explores the surface."""
         if self.proxy is None or len(rays) == 0:
             return

@@ -77,7 +77,7 @@ class NerfstudioHost(nn.Module):
         self.frame = frame
         self.own_losses = own_losses
         # Recorded now: stages change requires_grad later, but some parameters are never trained.
-        self._moving = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
+        self._trained = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
 
     # -------------------------------------------------------------------------------------- the host contract
 
@@ -112,7 +112,7 @@ class NerfstudioHost(nn.Module):
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """All parameters that the model trains, as `geometry`: its fields hold shape and colour together."""
-        return {"geometry": self._moving}
+        return {"geometry": self._trained}
 
     # ---------------------------------------------------------------------------------------------- the model
 

@@ -67,7 +67,7 @@ def _share_light(run: Training) -> None:
 
 def review_before_stage(run: Training, step: int) -> None:
     """Take the measurements before a stage that trains material."""
-    if run.model.stages[stage_at(step, run.config.train).stage].moves_material:
+    if run.model.stages[stage_at(step, run.config.train).stage].trains_material:
         _review_effects(run, step, review_surface, Stream.SURFACE)
         _start_light(run, step)
         _review_effects(run, step, review_material, Stream.MATERIAL)
