@@ -50,7 +50,7 @@ def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
         return
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
-        with timed("light_fits", apart=True):
+        with timed("light_fits", undivided=True):
             evidence = solver.solve(run.model.brdf, run.model.scene)
         lamps = run.model.lamps.count
         note_fit(run.fits, evidence, lamps, step)
@@ -102,7 +102,7 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
     if max_pixels < MIN_PIXELS or not is_search_due(model, position):
         return
     if run.fabric.is_global_zero:
-        with timed("light_fits", apart=True):
+        with timed("light_fits", undivided=True):
             seed_stream(run.config.train.seed, Stream.SEARCH, step)
             summary = improve_material(model, light_places(model, run.pixels, max_pixels))
         if summary is not None:
