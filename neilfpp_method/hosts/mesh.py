@@ -17,7 +17,14 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import (
+    TINY,
+    FirstHits,
+    face_normals,
+    first_hits_of,
+    meet,
+    normals_towards_viewer,
+)
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
@@ -32,8 +39,6 @@ SAME_MESH = 1e-6
 """Difference of fingerprints up to which two meshes are the same. Rounding on another processor changes them
 by about 1e-8.
 """
-TINY = 1e-18
-"""Length below which a cross product of edges has no direction; tiny, as triangles may be small."""
 CREASE = math.radians(40)
 """Angle between the normals of two faces above which their common edge is sharp; otherwise normals are
 interpolated across it.
@@ -74,8 +79,7 @@ class MeshHost(nn.Module):
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
         triangles = mesh.vertices[mesh.faces]
-        across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        outward = safe_normalize(across, eps=TINY)
+        outward = face_normals(triangles)
         smooth = corner_normals(mesh, outward)
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
@@ -170,21 +174,18 @@ class MeshHost(nn.Module):
         smooth = safe_normalize(
             (meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
         )
-        # At grazing angles the interpolated normal can face away from the viewer; then use the triangle's.
-        faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0.0
         return Crossings(
             rows=rows,
             position=origins + meeting.distance[:, None] * directions,
-            normal=torch.where(faces_viewer, smooth, flat),
+            normal=normals_towards_viewer(smooth, flat, directions),
             outside=(flat * directions).sum(-1) < 0.0,
         )
 
     def _first_hits(self) -> FirstHits:
-        """The tracer of the current device, made at first use: Embree on a CPU if installed, else a tree."""
+        """The tracer of the current device, made at first use."""
         device = self.triangles.device
         if device not in self._tracers:
-            embree = embree_tracer(self.triangles) if device.type == "cpu" else None
-            self._tracers[device] = embree or tree_tracer(build_tree(self.triangles))
+            self._tracers[device] = first_hits_of(self.triangles)
         return self._tracers[device]
 
     def _background(self, rays: RayBatch, hit_rows: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:

@@ -14,11 +14,27 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["BoxTree", "FirstHits", "Meeting", "build_tree", "embree_tracer", "meet", "tree_tracer"]
+from neilfpp_method.shading.frame import safe_normalize
+
+__all__ = [
+    "TINY",
+    "BoxTree",
+    "FirstHits",
+    "Meeting",
+    "build_tree",
+    "embree_tracer",
+    "face_normals",
+    "first_hits_of",
+    "meet",
+    "normals_towards_viewer",
+    "tree_tracer",
+]
 
 FirstHits = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], Int[Tensor, " N"]]
 """Maps origins and unit directions to the index of the triangle that each ray hits first, −1 for a miss."""
 
+TINY = 1e-18
+"""Length below which a cross product of edges has no direction; tiny, because triangles may be small."""
 BRANCHES = 8
 """Children per node of the tree."""
 MORTON_BITS = 20
@@ -31,6 +47,28 @@ two triangles share do not pass between them.
 """
 MIN_COMPONENT = 1e-12
 """Lower bound on the size of a direction's components, so that their inverses are finite."""
+
+
+def first_hits_of(triangles: Float[Tensor, "F 3 3"]) -> FirstHits:
+    """Make a tracer on the device of the triangles: Embree on a CPU if it is installed, else a tree."""
+    embree = embree_tracer(triangles) if triangles.device.type == "cpu" else None
+    return embree or tree_tracer(build_tree(triangles))
+
+
+def face_normals(triangles: Float[Tensor, "F 3 3"]) -> Float[Tensor, "F 3"]:
+    """Unit normals of triangles, on the side from which their corners run counter-clockwise."""
+    across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return safe_normalize(across, eps=TINY)
+
+
+def normals_towards_viewer(
+    smooth: Float[Tensor, "N 3"], flat: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Shading normals at hits of rays: the interpolated normal, or that of the triangle at grazing angles, at
+    which the interpolated normal can face away from the viewer.
+    """
+    faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0
+    return torch.where(faces_viewer, smooth, flat)
 
 
 @dataclass(frozen=True)
@@ -99,7 +137,7 @@ def build_tree(triangles: Float[Tensor, "F 3 3"]) -> BoxTree:
 
 
 def tree_tracer(tree: BoxTree) -> FirstHits:
-    """Deterministic first hits by a tree, on its device."""
+    """Make a deterministic tracer that uses a tree, on its device."""
 
     def first_hits(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
         parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
@@ -167,7 +205,7 @@ def _morton(points: Float[Tensor, "F 3"]) -> Int[Tensor, " F"]:
 
 
 def embree_tracer(triangles: Float[Tensor, "F 3 3"]) -> FirstHits | None:
-    """First hits by Embree, for rays on a CPU; None if Embree is not installed."""
+    """Make a tracer that uses Embree, for rays on a CPU; None if Embree is not installed."""
     try:
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError:

@@ -65,7 +65,7 @@ SPHERE = trimesh.creation.icosphere(subdivisions=5, radius=0.7)
 def tracer(request, monkeypatch) -> str:
     """Both implementations of first hits."""
     if request.param == "tree":
-        monkeypatch.setattr("neilfpp_method.hosts.mesh.embree_tracer", lambda triangles: None)
+        monkeypatch.setattr("neilfpp_method.hosts.mesh_tracing.embree_tracer", lambda triangles: None)
     return request.param
 
 

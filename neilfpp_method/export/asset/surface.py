@@ -15,7 +15,7 @@ from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.export.mesh import surface_mesh
 from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
-from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import FirstHits, face_normals, first_hits_of, meet
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.train.run import Run
 
@@ -73,17 +73,13 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
 def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> AssetSurface:
     """Build a surface with normals from its triangles: smooth, except at creases (`corner_normals`)."""
     mesh = Mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
-    triangles = mesh.vertices[mesh.faces]
-    across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return AssetSurface(
-        vertices, faces, corner_normals(mesh, safe_normalize(across, eps=1e-18)).double().numpy()
-    )
+    normals = corner_normals(mesh, face_normals(mesh.vertices[mesh.faces]))
+    return AssetSurface(vertices, faces, normals.double().numpy())
 
 
 def first_hits(surface: AssetSurface) -> FirstHits:
-    """Build a function that returns the first triangle hit by each ray; uses Embree if it is installed."""
-    triangles = surface.triangles()
-    return embree_tracer(triangles) or tree_tracer(build_tree(triangles))
+    """Make a function that returns the first triangle hit by each ray."""
+    return first_hits_of(surface.triangles())
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import first_hits_of, meet
 
 __all__ = ["Texels", "covered_texels", "dilate"]
 
@@ -46,7 +46,7 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
     The triangles in texture space form a flat surface at z = 0, and one ray per texel is traced onto it.
     """
     flat = torch.from_numpy(np.pad(mesh.uv, ((0, 0), (0, 1)))).float()[torch.from_numpy(mesh.faces)]
-    tracer = embree_tracer(flat) or tree_tracer(build_tree(flat))
+    tracer = first_hits_of(flat)
     down = torch.tensor([0.0, 0.0, -1.0])
     for number in torch.arange(size * size).split(TEXELS_AT_ONCE):
         u, v = (number % size + 0.5) / size, 1 - (number // size + 0.5) / size
