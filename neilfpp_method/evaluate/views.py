@@ -24,6 +24,7 @@ __all__ = [
     "HeldOut",
     "KnownView",
     "RenderedView",
+    "evenly_spread",
     "known_test_views",
     "mask_source",
     "mean_observed_color",
@@ -71,6 +72,16 @@ def render_view(
             combined.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values
         on_progress((k + 1) / parts)
     return RenderedView(view.name, {name: _image(values, view) for name, values in combined.items()})
+
+
+def evenly_spread(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """Choose `count` of the names at even distances, or all if there are fewer.
+
+    >>> evenly_spread("abcde", 3)
+    ('a', 'c', 'e')
+    """
+    rows = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+    return tuple(names[row] for row in rows)
 
 
 def render_test_views(
