@@ -29,10 +29,10 @@ from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.adapt import adapt, check_parameter_groups
-from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, TracesLight
 from neilfpp_method.hosts.batches import check_batch, check_like, check_points, check_step, pixel_batch
 from neilfpp_method.hosts.capabilities import missing_capabilities
+from neilfpp_method.hosts.conversion import Rendered, as_hits
 from neilfpp_method.hosts.first_batches import FirstBatches
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.image import rays_like
@@ -108,7 +108,7 @@ class AttachedNeilf(nn.Module):
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
             step: index of the step, counted from 0, from which `config.train` determines the stage; or the
                 name of a stage, for example "joint".
-            hits: what the host rendered for these rays, in any form that `hosts.answers` reads; if None, the
+            hits: what the host rendered for these rays, in any form that `hosts.conversion` reads; if None, the
                 host is rendered here. In the joint stage gradients flow back through it.
 
         Returns:

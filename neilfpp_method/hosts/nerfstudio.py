@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import no_hits
 from neilfpp_method.hosts.base import RegularizedHits
+from neilfpp_method.hosts.conversion import no_hits
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, PixelBatch, RayBatch, SurfaceHits

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from neilfpp_method.hosts.answers import no_hits
+from neilfpp_method.hosts.conversion import no_hits
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Indexable, RayBatch, SceneLight, SurfaceHits

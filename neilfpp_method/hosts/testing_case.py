@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host
+from neilfpp_method.hosts.conversion import as_hits
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["HIT_SHARE", "Case", "ContractBroken", "Modes", "render_checked"]

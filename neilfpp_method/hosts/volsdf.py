@@ -128,7 +128,7 @@ class VolSdfHost(nn.Module):
     # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Color, position and normal of each ray, blended with the rendering weights (METHOD §3).
+        """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
 
         With `volume.skip_empty`, evaluation without gradients samples only the parts of rays that may be
         visible, according to a grid of the current field.

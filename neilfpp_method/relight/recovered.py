@@ -11,19 +11,9 @@ from neilfpp_method.export.surface_cache import extracted_surface, shading_norma
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.relight.surface import Surface
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["check_material", "surface_of_run"]
-
-
-def check_material(run: Run) -> None:
-    """Check that the run has a material.
-
-    Raises:
-        UserError: no stage has estimated the material yet.
-    """
-    if not run.has_material:
-        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
 
 
 @torch.no_grad()

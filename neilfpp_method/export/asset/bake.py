@@ -107,8 +107,7 @@ def bake(
         ]
         texture[texels.number] = np.rint(255 * np.concatenate(values, axis=1).clip(0, 1)).astype(np.uint8)
         covered[texels.number] = True
-        on_progress((texels.number[-1] + 1) / size**2 if len(texels.number) else 0.0)
-    on_progress(1.0)
+        on_progress(texels.done)
     dilated = dilate(texture.reshape(size, size, -1), covered.reshape(size, size))
     return Textures(
         **{name: dilated[..., channels] for name, channels in CHANNELS.items()},

@@ -47,15 +47,15 @@ class Simplified:
     distance: Distance
 
 
-def simplified(fine: AssetSurface, most_faces: int, error: float) -> Simplified:
-    """Reduce the number of triangles to `most_faces`, then halve it while the distance stays within `error`.
+def simplified(fine: AssetSurface, max_faces: int, error: float) -> Simplified:
+    """Reduce the number of triangles to `max_faces`, then halve it while the distance stays within `error`.
 
     Args:
         fine: the surface.
-        most_faces: largest number of triangles, whatever the distance.
+        max_faces: largest number of triangles, whatever the distance.
         error: largest distance that a further reduction may cause, scene units.
     """
-    count = min(most_faces, len(fine.faces))
+    count = min(max_faces, len(fine.faces))
     best = _with_faces(fine, count)
     while count // 2 >= MIN_FACES:
         count //= 2

@@ -27,11 +27,13 @@ class Texels:
         number: row-major index of the texel, from the top.
         face: index of the triangle.
         weights: barycentric coordinates of the texel's centre.
+        done: share of the texture up to the end of this batch, in (0, 1].
     """
 
     number: Int[np.ndarray, " T"]
     face: Int[np.ndarray, " T"]
     weights: Float[np.ndarray, "T 3"]
+    done: float
 
     def interpolate(
         self, values: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]
@@ -56,7 +58,8 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
         face, origins = face[rows], origins[rows]
         weights = meet(origins, down.expand_as(origins), flat[face]).weights.clamp(0, 1).double()
         weights = weights / weights.sum(-1, keepdim=True)
-        yield Texels(number[rows].numpy(), face.numpy(), weights.numpy())
+        done = (int(number[-1]) + 1) / size**2
+        yield Texels(number[rows].numpy(), face.numpy(), weights.numpy(), done)
 
 
 def dilate(
