@@ -108,8 +108,8 @@ class AttachedNeilf(nn.Module):
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
             step: index of the step, counted from 0, from which `config.train` determines the stage; or the
                 name of a stage, for example "joint".
-            hits: what the host rendered for these rays, in any form that `hosts.conversion` reads; if None, the
-                host is rendered here. In the joint stage gradients flow back through it.
+            hits: what the host rendered for these rays, in any form that `hosts.conversion` reads; if None,
+                the host is rendered here. In the joint stage gradients flow back through it.
 
         Returns:
             The weighted sum of the losses, and each term before its weight.

@@ -18,8 +18,8 @@ class CallableHost:
     """Makes a host of a function (origins, directions) → (color, position, normal).
 
     A ray whose normal is shorter than ½ or not finite is a miss. The function may return a dictionary or
-    `SurfaceHits` instead, which is read as `hosts.conversion` says. This class is not an `nn.Module`, so that a
-    function that is one is not registered as a submodule.
+    `SurfaceHits` instead, which is read as `hosts.conversion` says. This class is not an `nn.Module`, so that
+    a function that is one is not registered as a submodule.
     """
 
     def __init__(self, function: RenderFunction) -> None:
