@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.export.mesh import surface_mesh
-from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
+from neilfpp_method.export.surface_cache import shaded_surface, shading_normals
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
 from neilfpp_method.hosts.mesh_tracing import FirstHits, face_normals, first_hits_of, meet
 from neilfpp_method.shading.frame import safe_normalize
@@ -52,7 +52,7 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
 
     Args:
         run: a run with a mesh or a distance field.
-        resolution: resolution of `extracted_surface` for a distance field.
+        resolution: resolution of `shaded_surface` for a distance field.
         say: receives a message if a file in the run folder is replaced.
 
     Raises:
@@ -64,8 +64,7 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
         normals = shading_normals(host, position, normal).double().cpu().numpy().reshape(-1, 3, 3)
         return AssetSurface(np.array(mesh.vertices, np.float64), np.array(mesh.faces), normals)
-    surface = extracted_surface(run, resolution, shaded=True, say=say)
-    assert surface.normals is not None
+    surface = shaded_surface(run, resolution, say)
     faces = surface.faces.astype(np.int64)
     return AssetSurface(surface.vertices.astype(np.float64), faces, surface.normals.astype(np.float64)[faces])
 
