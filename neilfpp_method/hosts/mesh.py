@@ -22,7 +22,7 @@ from neilfpp_method.hosts.mesh_tracing import (
     FirstHits,
     face_normals,
     first_hits_of,
-    meet,
+    intersect_planes,
     normals_towards_viewer,
 )
 from neilfpp_method.hosts.radiance import background_field, radiance_field
@@ -48,8 +48,8 @@ RADIANCE_AT_ONCE = 2**16
 
 
 @dataclass(frozen=True)
-class Crossings:
-    """Rays that hit the mesh: their rows, hit positions and normals, and whether they hit the outside."""
+class MeshHits:
+    """Rays that hit the mesh: their rows, positions and normals of the hits, and whether the outside is hit."""
 
     rows: Int[Tensor, " K"]
     position: Float[Tensor, "K 3"]
@@ -111,7 +111,7 @@ class MeshHost(nn.Module):
     def render(self, rays: RayBatch) -> SurfaceHits:
         """First hit of each ray with R there; the background for a ray that misses."""
         with torch.no_grad():
-            hit = self.cross(rays)
+            hit = self.intersect(rays)
         wo = -rays.directions[hit.rows]
         radiance = self.radiance_field(hit.position, wo, hit.normal, hit.position[:, :0])
         nothing, zeros = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
@@ -128,7 +128,7 @@ class MeshHost(nn.Module):
         """R where rays from x along wi hit the mesh; the inside of the mesh stops rays and is black."""
         directions = wi.reshape(-1, 3)
         origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
-        hit = self.cross(RayBatch(origins, directions))
+        hit = self.intersect(RayBatch(origins, directions))
         radiance, distance = torch.zeros_like(directions), torch.full_like(directions[:, 0], torch.inf)
         distance[hit.rows] = (hit.position - origins[hit.rows]).norm(dim=-1)
         outside = torch.nonzero(hit.outside)[:, 0]
@@ -150,7 +150,7 @@ class MeshHost(nn.Module):
         up = normal.repeat_interleave(NEIGHBORS, 0)
 
         def normals_below(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-            hit = self.cross(RayBatch(x + self.normal_radius * up, -up))
+            hit = self.intersect(RayBatch(x + self.normal_radius * up, -up))
             return torch.zeros_like(x).index_put((hit.rows,), hit.normal * hit.outside[:, None])
 
         return smooth_normals(normals_below, position, normal, self.normal_radius)
@@ -164,19 +164,19 @@ class MeshHost(nn.Module):
 
     # ----------------------------------------------------------------------------------------------- geometry
 
-    def cross(self, rays: RayBatch) -> Crossings:
+    def intersect(self, rays: RayBatch) -> MeshHits:
         """First hits of rays with the mesh, on either side."""
         numbers = self._first_hits()(rays.origins, rays.directions)
         rows = torch.nonzero(numbers >= 0)[:, 0]
         numbers, origins, directions = numbers[rows], rays.origins[rows], rays.directions[rows]
-        meeting = meet(origins, directions, self.triangles[numbers].to(origins.dtype))
+        on_plane = intersect_planes(origins, directions, self.triangles[numbers].to(origins.dtype))
         flat = self.outward[numbers].to(origins.dtype)
         smooth = safe_normalize(
-            (meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
+            (on_plane.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
         )
-        return Crossings(
+        return MeshHits(
             rows=rows,
-            position=origins + meeting.distance[:, None] * directions,
+            position=origins + on_plane.distance[:, None] * directions,
             normal=normals_towards_viewer(smooth, flat, directions),
             outside=(flat * directions).sum(-1) < 0.0,
         )

@@ -1,6 +1,6 @@
 """First hits of rays with triangles: by tensor operations on the device of the rays, or by Embree on a CPU.
 
-Both return the triangle that each ray hits first; `meet` computes where.
+Both return the triangle that each ray hits first; `intersect_planes` computes where.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ __all__ = [
     "TINY",
     "BoxTree",
     "FirstHits",
-    "Meeting",
+    "PlaneHits",
     "build_tree",
     "embree_tracer",
     "face_normals",
     "first_hits_of",
-    "meet",
+    "intersect_planes",
     "normals_towards_viewer",
     "tree_tracer",
 ]
@@ -72,16 +72,18 @@ def normals_towards_viewer(
 
 
 @dataclass(frozen=True)
-class Meeting:
-    """Where rays hit their triangles: the distance along the ray, and barycentric weights of the corners."""
+class PlaneHits:
+    """Intersections of rays with the planes of triangles: distance along the ray, and barycentric weights of
+    the corners, which are negative outside of the triangle.
+    """
 
     distance: Float[Tensor, " N"]
     weights: Float[Tensor, "N 3"]
 
 
-def meet(
+def intersect_planes(
     origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]
-) -> Meeting:
+) -> PlaneHits:
     """Intersect each ray with the plane of its triangle (Möller & Trumbore 1997).
 
     The result is not finite for a ray parallel to the plane.
@@ -94,7 +96,7 @@ def meet(
     u = (offset * across).sum(-1) / determinant
     turned = torch.linalg.cross(offset, first)
     v = (directions * turned).sum(-1) / determinant
-    return Meeting((second * turned).sum(-1) / determinant, torch.stack([1.0 - u - v, u, v], dim=-1))
+    return PlaneHits((second * turned).sum(-1) / determinant, torch.stack([1.0 - u - v, u, v], dim=-1))
 
 
 # -------------------------------------------------------------------------------------------- a tree of boxes
@@ -162,9 +164,9 @@ def _descend(
         kept = torch.nonzero(met)[:, 0]
         rays = rays[kept].repeat_interleave(BRANCHES)
         nodes = (BRANCHES * nodes[kept][:, None] + children).reshape(-1)
-    meeting = meet(origins[rays], directions[rays], tree.triangles[nodes])
-    inside = (meeting.weights >= -SLACK).all(-1) & (meeting.distance > 0.0)
-    distance = torch.where(inside, meeting.distance, torch.inf)
+    hits = intersect_planes(origins[rays], directions[rays], tree.triangles[nodes])
+    inside = (hits.weights >= -SLACK).all(-1) & (hits.distance > 0.0)
+    distance = torch.where(inside, hits.distance, torch.inf)
     nearest = distance.new_full((count,), torch.inf).scatter_reduce(0, rays, distance, "amin")
     # Of several triangles at the same distance take the one with the largest index, in every run.
     winner = torch.where(inside & (distance == nearest[rays]), tree.numbers[nodes], -1)

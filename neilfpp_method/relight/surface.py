@@ -8,7 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neilfpp_method.hosts.mesh_tracing import face_normals, first_hits_of, meet, normals_towards_viewer
+from neilfpp_method.hosts.mesh_tracing import (
+    face_normals,
+    first_hits_of,
+    intersect_planes,
+    normals_towards_viewer,
+)
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Indexable
 
@@ -66,7 +71,7 @@ class Surface:
         numbers = self._first_hits(origins, directions)
         rows = torch.nonzero(numbers >= 0)[:, 0]
         numbers, origins, directions = numbers[rows], origins[rows], directions[rows]
-        hit = meet(origins, directions, self.triangles[numbers])
+        hit = intersect_planes(origins, directions, self.triangles[numbers])
         flat = self.outward[numbers]
         # Barycentric weights are NaN if a ray lies in the plane of its triangle.
         weights = hit.weights.nan_to_num(1 / 3)[..., None]
@@ -93,5 +98,5 @@ class Surface:
         if before is None:
             return hit
         rows = torch.nonzero(hit)[:, 0]
-        distance = meet(origins[rows], directions[rows], self.triangles[numbers[rows]]).distance
+        distance = intersect_planes(origins[rows], directions[rows], self.triangles[numbers[rows]]).distance
         return hit.index_put((rows,), distance < before[rows])

@@ -15,11 +15,11 @@ from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.export.mesh import surface_mesh
 from neilfpp_method.export.surface_cache import shaded_surface, shading_normals
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
-from neilfpp_method.hosts.mesh_tracing import FirstHits, face_normals, first_hits_of, meet
+from neilfpp_method.hosts.mesh_tracing import FirstHits, face_normals, first_hits_of, intersect_planes
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.train.run import Run
 
-__all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "meet_along"]
+__all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "hits_along_normals"]
 
 STEP_BACK = 1e-4
 """Distance that a ray starts behind its point, scene units, so that it hits a surface through the point."""
@@ -98,7 +98,7 @@ class NormalHits:
     normal: Float[np.ndarray, "N 3"]
 
 
-def meet_along(
+def hits_along_normals(
     surface: AssetSurface,
     tracer: FirstHits,
     position: Float[np.ndarray, "N 3"],
@@ -127,7 +127,7 @@ def meet_along(
         rows = torch.nonzero(face >= 0)[:, 0]
         if not len(rows):
             continue
-        hit = meet(start[rows], direction[rows], triangles[face[rows]])
+        hit = intersect_planes(start[rows], direction[rows], triangles[face[rows]])
         shaded = safe_normalize((hit.weights.clamp(0, 1)[..., None] * corners[face[rows]]).sum(1))
         distance = (hit.distance - STEP_BACK).abs()
         nearer = (distance < nearest[rows]) & ((shaded * along[rows]).sum(-1) > 0)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.hosts.mesh_tracing import first_hits_of, meet
+from neilfpp_method.hosts.mesh_tracing import first_hits_of, intersect_planes
 
 __all__ = ["Texels", "covered_texels", "dilate"]
 
@@ -56,7 +56,7 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
         face = tracer(origins, down.expand_as(origins))
         rows = torch.nonzero(face >= 0)[:, 0]
         face, origins = face[rows], origins[rows]
-        weights = meet(origins, down.expand_as(origins), flat[face]).weights.clamp(0, 1).double()
+        weights = intersect_planes(origins, down.expand_as(origins), flat[face]).weights.clamp(0, 1).double()
         weights = weights / weights.sum(-1, keepdim=True)
         done = (int(number[-1]) + 1) / size**2
         yield Texels(number[rows].numpy(), face.numpy(), weights.numpy(), done)
