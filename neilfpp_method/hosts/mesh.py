@@ -49,7 +49,7 @@ RADIANCE_AT_ONCE = 2**16
 
 @dataclass(frozen=True)
 class MeshHits:
-    """Rays that hit the mesh: their rows, positions and normals of the hits, and whether the outside is hit."""
+    """Rays that hit the mesh: rows, positions and normals of the hits, and whether they hit the outside."""
 
     rows: Int[Tensor, " K"]
     position: Float[Tensor, "K 3"]
