@@ -133,6 +133,22 @@ def time_section(
     """
     if not stages:
         return element("p", "No stage has been timed.")
+    pictures = (
+        element(
+            "figure",
+            element("img", class_="map", src=url, alt=f"Preview at the end of {stage}"),
+            element("figcaption", f"End of {STAGE_TITLES.get(stage, stage)}: {_panels_of(stage)}"),
+        )
+        for stage, url in previews.items()
+    )
+    curve = quality_curve(checks)
+    caption = "Quality during training at held-back pixels, small patches of training views:"
+    caption = element("p", caption, class_="pale") if curve else None
+    return joined(_time_table(stages, work), work_bars(work, STAGE_TITLES), caption, curve, *pictures)
+
+
+def _time_table(stages: Mapping[str, float], work: Mapping[str, Mapping[str, float]]) -> Html:
+    """A row for each stage with its largest kinds of work, and one for the total."""
     total = sum(stages.values())
     rows = [
         element(
@@ -152,19 +168,7 @@ def time_section(
             *(2 * [element("td")]),
         )
     )
-    pictures = (
-        element(
-            "figure",
-            element("img", class_="map", src=url, alt=f"Preview at the end of {stage}"),
-            element("figcaption", f"End of {STAGE_TITLES.get(stage, stage)}: {_panels_of(stage)}"),
-        )
-        for stage, url in previews.items()
-    )
-    times = table(("stage", "time", "", "largest parts"), *rows)
-    curve = quality_curve(checks)
-    caption = "Quality during training at held-back pixels, small patches of training views:"
-    caption = element("p", caption, class_="pale") if curve else None
-    return joined(times, work_bars(work, STAGE_TITLES), caption, curve, *pictures)
+    return table(("stage", "time", "", "largest parts"), *rows)
 
 
 def _panels_of(stage: str) -> str:
