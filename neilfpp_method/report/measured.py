@@ -80,7 +80,7 @@ def finite_numbers(file: Path, values: Mapping[str, Any]) -> dict[str, float]:
     numbers = {k: v for k, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)}
     for key, value in numbers.items():
         if not is_finite_number(value):
-            raise UserError(f"{file}: {key} is not a finite number", "remove the file, and measure again")
+            raise UserError(f"{file}: {key} is not a finite number", "restore the file, or remove it")
     return {key: float(value) for key, value in numbers.items()}
 
 
