@@ -45,9 +45,7 @@ from neilfpp_method.timing.ledger import timed
 __all__ = ["EVAL_RAYS", "NeilfModel"]
 
 EVAL_RAYS = 2048
-"""Largest number of rays in one call of `NeilfModel.maps`, so that the incident directions of their surface
-points fit in memory.
-"""
+"""Largest number of rays in one call of `NeilfModel.maps`; their incident directions must fit in memory."""
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
 SURFACE_OPACITY = 0.5
@@ -340,11 +338,7 @@ class NeilfModel(nn.Module):
 
     @torch.no_grad()
     def host_maps(self, rays: RayBatch) -> Maps:
-        """Render the maps that need neither material nor light: `rgb` is the host's colour, the material 0.
-
-        Args:
-            rays: rays in the scene frame.
-        """
+        """Render the maps that need neither material nor light: `rgb` is the host's colour, material is 0."""
         return Maps.of_host(rays, self.host.render(rays))
 
     @torch.no_grad()
@@ -364,20 +358,14 @@ class NeilfModel(nn.Module):
         normal = self.shading_normals(position, hits.normal[rows])
         material = self.brdf(position)
         shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
+        found = {"rgb": shading.color, "diffuse": shading.diffuse, "specular": shading.specular}
+        found |= {name: getattr(material, name) for name in ("base_color", "roughness", "metallic")}
+        found["normal"] = normal
 
-        def on_surface(whole: Float[Tensor, "N C"], value: Float[Tensor, "P C"]) -> Float[Tensor, "N C"]:
-            return whole.index_put((rows,), value.to(whole.dtype))
+        def on_surface(name: str, whole: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+            return whole.index_put((rows,), found[name].to(whole.dtype)) if name in found else whole
 
-        return replace(
-            maps,
-            rgb=on_surface(maps.rgb, shading.color),
-            diffuse=on_surface(maps.diffuse, shading.diffuse),
-            specular=on_surface(maps.specular, shading.specular),
-            base_color=on_surface(maps.base_color, material.base_color),
-            roughness=on_surface(maps.roughness, material.roughness),
-            metallic=on_surface(maps.metallic, material.metallic),
-            normal=on_surface(maps.normal, normal),
-        )
+        return maps.map_named(on_surface)
 
     # --------------------------------------------------------------------------------------------- parameters
 
