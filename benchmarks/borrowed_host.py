@@ -82,7 +82,7 @@ class TrueSurface:
             view = pixels.view(i, gradients=False)
             for start in range(0, len(view), AT_ONCE):
                 part = view[start : start + AT_ONCE]
-                met = mesh.cross(part.rays)
+                met = mesh.intersect(part.rays)
                 cell = self._cell(met.position)
                 total.index_add_(0, cell, part.color[met.rows])
                 count.index_add_(0, cell, torch.ones(len(cell), 1))
@@ -93,7 +93,7 @@ class TrueSurface:
         self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Colour, position and normal of rays; zero normals where they miss."""
-        met = self.mesh.cross(RayBatch(origins, directions))
+        met = self.mesh.intersect(RayBatch(origins, directions))
         outside = met.outside[:, None]
         nothing = torch.zeros_like(origins)
         return (

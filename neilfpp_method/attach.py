@@ -29,10 +29,10 @@ from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.measure import measure_hits
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.hosts.adapt import adapt, check_parameter_groups
-from neilfpp_method.hosts.answers import Rendered, as_hits
 from neilfpp_method.hosts.base import HasParameterGroups, TracesLight
 from neilfpp_method.hosts.batches import check_batch, check_like, check_points, check_step, pixel_batch
 from neilfpp_method.hosts.capabilities import missing_capabilities
+from neilfpp_method.hosts.conversion import Rendered, as_hits
 from neilfpp_method.hosts.first_batches import FirstBatches
 from neilfpp_method.hosts.foreign import ForeignHost, answers_secondary_rays, proxy_for
 from neilfpp_method.hosts.image import rays_like
@@ -86,8 +86,9 @@ class AttachedNeilf(nn.Module):
             model.borrowed and config.inter_reflection.mode != "off" and answers_secondary_rays(_inner(host))
         )
         render = host.render if renders_secondary_rays else None
-        near_too = proxy is None
-        self.first_batches = FirstBatches(host_name(host), config.shading.hit_share, facts, render, near_too)
+        self.first_batches = FirstBatches(
+            host_name(host), config.shading.hit_share, facts, render, traced_by_host=proxy is None
+        )
         self.step_guard = StepGuard(log.warning)
         self.watch = Watch(None, log.warning)
         self._steps, self._with_material = 0, False
@@ -107,8 +108,8 @@ class AttachedNeilf(nn.Module):
             batch: pixels with their rays in the scene frame; see `pixel_batch`.
             step: index of the step, counted from 0, from which `config.train` determines the stage; or the
                 name of a stage, for example "joint".
-            hits: what the host rendered for these rays, in any form that `hosts.answers` reads; if None, the
-                host is rendered here. In the joint stage gradients flow back through it.
+            hits: what the host rendered for these rays, in any form that `hosts.conversion` reads; if None,
+                the host is rendered here. In the joint stage gradients flow back through it.
 
         Returns:
             The weighted sum of the losses, and each term before its weight.
@@ -126,9 +127,9 @@ class AttachedNeilf(nn.Module):
             # A zero that requires a gradient: a loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
         plan = self.model.stages[position.stage]
-        if self.training and plan.moves_material:
+        if self.training and plan.trains_material:
             self.places.before_step(self.model, self.light_solver, position)
-        result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, plan.moves_host))
+        result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, plan.trains_host))
         total = weigh(result.terms, weights)
         if self.training:
             number = self._steps if isinstance(step, str) else int(step)
@@ -180,11 +181,11 @@ class AttachedNeilf(nn.Module):
             with torch.no_grad():
                 hits = self.model.host.image_hits(camera, rays)
         self._check_device_and_dtype("rays", rays.origins)
-        rendered = self._host_hits(rays, hits, moves_host=False)
+        rendered = self._host_hits(rays, hits, trains_host=False)
         if rendered is None:
             return self.model.maps(rays)
         starts = range(0, max(len(rays), 1), EVAL_RAYS)
-        parts = [self.model.maps(rays[i : i + EVAL_RAYS], hits=rendered[i : i + EVAL_RAYS]) for i in starts]
+        parts = [self.model.maps(rays[i : i + EVAL_RAYS], rendered[i : i + EVAL_RAYS]) for i in starts]
         return Maps.joined(parts)
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -234,14 +235,14 @@ class AttachedNeilf(nn.Module):
     def _after_step(self, result: StepResult, position: StagePosition, number: int) -> None:
         """Solve for the light if that is due, and check the health of the training."""
         plan = self.model.stages[position.stage]
-        if plan.moves_material:
+        if plan.trains_material:
             self.places.observe(result.surface)
         self.light_solver.observe(result)
         if not self.places.is_waiting(self.light_solver):
             if self.light_solver.due:
                 self.watch.after_fit(self.light_solver.points, number)
             self.light_solver.solve(self.model.brdf, self.model.scene)
-        self._with_material = plan.moves_material
+        self._with_material = plan.trains_material
         self.watch.after_step(plan, result, number)
         if position.step + 1 == position.length:
             self.health()
@@ -256,7 +257,7 @@ class AttachedNeilf(nn.Module):
     def _check_device_and_dtype(self, name: str, value: Tensor) -> None:
         check_like(name, value, next(self.model.brdf.parameters()))
 
-    def _host_hits(self, rays: RayBatch, hits: Rendered | None, moves_host: bool) -> SurfaceHits | None:
+    def _host_hits(self, rays: RayBatch, hits: Rendered | None, trains_host: bool) -> SurfaceHits | None:
         """The host's hits of camera rays, given or rendered; None if the model renders the host itself.
 
         A host that answers camera rays only is rendered here, because its `render` uses the proxy.
@@ -266,7 +267,7 @@ class AttachedNeilf(nn.Module):
             return host.read(rays, hits) if isinstance(host, ForeignHost) else as_hits(host, rays, hits)
         if not isinstance(host, ForeignHost) or answers_secondary_rays(host.inner):
             return None
-        with torch.set_grad_enabled(torch.is_grad_enabled() and moves_host):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and trains_host):
             return host.camera_hits(rays)
 
     def _observe(self, batch: PixelBatch, hits: SurfaceHits) -> None:
@@ -276,7 +277,7 @@ class AttachedNeilf(nn.Module):
         self.first_batches.hits(batch, hits)
         self._last_rendered = batch, hits.detach()
         if isinstance(self.model.host, ForeignHost):
-            self.model.host.show_proxy(batch.rays, hits)
+            self.model.host.update_proxy(batch.rays, hits)
 
 
 def attach_neilf(

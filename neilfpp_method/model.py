@@ -45,9 +45,7 @@ from neilfpp_method.timing.ledger import timed
 __all__ = ["EVAL_RAYS", "NeilfModel"]
 
 EVAL_RAYS = 2048
-"""Largest number of rays in one call of `NeilfModel.maps`, so that the incident directions of their surface
-points fit in memory.
-"""
+"""Largest number of rays in one call of `NeilfModel.maps`; their incident directions must fit in memory."""
 CLEAR_OPACITY = 0.01
 """Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
 SURFACE_OPACITY = 0.5
@@ -105,7 +103,7 @@ class NeilfModel(nn.Module):
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
         # The trainer of a borrowed host may move its surface in any step, so no point is reused.
-        surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].moves_host
+        surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].trains_host
         self.replay = PointReplay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
@@ -150,7 +148,7 @@ class NeilfModel(nn.Module):
         plan, active = self.stages[stage], active_losses(stage, self.config, self.stages)
         if not active:
             return StepResult.of({}, SurfacePixels.empty_like(batch), batch[:0])
-        reuses_points = self.training and not plan.moves_host
+        reuses_points = self.training and not plan.trains_host
         if reuses_points:
             batch, hits = self._rays_to_render(batch, hits)
 
@@ -158,7 +156,7 @@ class NeilfModel(nn.Module):
         hits, terms = self._render_host(batch, plan, active, hits)
         if "volume" in active:
             terms |= self._volume_losses(batch, hits)
-        if not plan.moves_material:
+        if not plan.trains_material:
             return StepResult.of(terms, SurfacePixels.empty_like(batch), batch[:0])
 
         # 2. Surface points: rays on the object that hit a single surface.
@@ -200,7 +198,7 @@ class NeilfModel(nn.Module):
         self, batch: PixelBatch, plan: StagePlan, active: Mapping[str, float], hits: SurfaceHits | None
     ) -> tuple[SurfaceHits, dict[str, LossTerm]]:
         """Hits and the host's own active losses; without gradients if the stage does not train the host."""
-        with torch.set_grad_enabled(torch.is_grad_enabled() and plan.moves_host):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and plan.trains_host):
             if hits is not None:
                 hits, terms = hits if torch.is_grad_enabled() else hits.detach(), {}
             elif isinstance(self.host, Regularized):
@@ -208,7 +206,7 @@ class NeilfModel(nn.Module):
                 hits, terms = regularized.hits, dict(regularized.terms)
             else:
                 hits, terms = self.host.render(batch.rays), {}
-            self.check_outputs(batch.rays, hits, color_moves="volume" in active and torch.is_grad_enabled())
+            self.check_outputs(batch.rays, hits, trains_color="volume" in active and torch.is_grad_enabled())
         if self.training:
             for observe in self.observers:
                 observe(batch, hits)
@@ -339,37 +337,35 @@ class NeilfModel(nn.Module):
         return shade(material, normal, wo, incident, self.lobe)
 
     @torch.no_grad()
-    def maps(self, rays: RayBatch, with_material: bool = True, hits: SurfaceHits | None = None) -> Maps:
+    def host_maps(self, rays: RayBatch) -> Maps:
+        """Render the maps that need neither material nor light: `rgb` is the host's colour, material is 0."""
+        return Maps.of_host(rays, self.host.render(rays))
+
+    @torch.no_grad()
+    def maps(self, rays: RayBatch, hits: SurfaceHits | None = None) -> Maps:
         """Render all maps of rays, for images and metrics. Split large images: memory grows with the rays.
 
         Args:
             rays: rays in the scene frame.
-            with_material: if False, neither BRDF nor light is evaluated, and `rgb` is the host's colour.
             hits: what the host rendered for these rays; if None, the host is rendered here.
         """
         hits = self.host.render(rays) if hits is None else hits.detach()
         maps = Maps.of_host(rays, hits)
         rows = torch.nonzero(hits.opacity > SURFACE_OPACITY)[:, 0]
-        if not with_material or not len(rows):
+        if not len(rows):
             return maps
         position, wo = hits.position[rows], -rays.directions[rows]
         normal = self.shading_normals(position, hits.normal[rows])
         material = self.brdf(position)
         shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
+        found = {"rgb": shading.color, "diffuse": shading.diffuse, "specular": shading.specular}
+        found |= {name: getattr(material, name) for name in ("base_color", "roughness", "metallic")}
+        found["normal"] = normal
 
-        def on_surface(whole: Float[Tensor, "N C"], value: Float[Tensor, "P C"]) -> Float[Tensor, "N C"]:
-            return whole.index_put((rows,), value.to(whole.dtype))
+        def on_surface(name: str, whole: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+            return whole.index_put((rows,), found[name].to(whole.dtype)) if name in found else whole
 
-        return replace(
-            maps,
-            rgb=on_surface(maps.rgb, shading.color),
-            diffuse=on_surface(maps.diffuse, shading.diffuse),
-            specular=on_surface(maps.specular, shading.specular),
-            base_color=on_surface(maps.base_color, material.base_color),
-            roughness=on_surface(maps.roughness, material.roughness),
-            metallic=on_surface(maps.metallic, material.metallic),
-            normal=on_surface(maps.normal, normal),
-        )
+        return maps.map_named(on_surface)
 
     # --------------------------------------------------------------------------------------------- parameters
 
@@ -386,7 +382,7 @@ class NeilfModel(nn.Module):
         """Set `requires_grad` of exactly the fields that a stage trains, and clear all gradients."""
         for name, parameters in self.parameter_groups().items():
             for parameter in parameters:
-                parameter.requires_grad_(name in self.stages[stage].moves)
+                parameter.requires_grad_(name in self.stages[stage].trains)
                 parameter.grad = None
 
 

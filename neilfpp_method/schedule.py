@@ -77,24 +77,24 @@ class StagePlan:
     Attributes:
         weights: for each loss whose weight is a setting, the name of that setting in `LossConfig`. The
             weights of the other losses are fixed (`active_losses`).
-        moves: parameter groups that the stage trains.
+        trains: parameter groups that the stage trains.
         grows: for each loss whose weight changes during the stage, the setting with the factor by which it
             has changed at the end of the stage.
     """
 
     weights: Mapping[str, str]
-    moves: frozenset[str]
+    trains: frozenset[str]
     grows: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def moves_host(self) -> bool:
+    def trains_host(self) -> bool:
         """Whether any parameter of the host is trained."""
-        return bool(self.moves & GEOMETRY)
+        return bool(self.trains & GEOMETRY)
 
     @property
-    def moves_material(self) -> bool:
+    def trains_material(self) -> bool:
         """Whether material and light are trained."""
-        return bool(self.moves & MATERIAL)
+        return bool(self.trains & MATERIAL)
 
 
 StageTable = Mapping[Stage, StagePlan]
@@ -109,10 +109,10 @@ STAGES: StageTable = {
             "surface": "surface",
             "point_cloud": "point_cloud",
         },
-        moves=GEOMETRY,
+        trains=GEOMETRY,
         grows={"hessian": "hessian_growth"},
     ),
-    Stage.MATERIAL_INIT: StagePlan(weights=MATERIAL_LOSSES, moves=MATERIAL),
+    Stage.MATERIAL_INIT: StagePlan(weights=MATERIAL_LOSSES, trains=MATERIAL),
     Stage.JOINT: StagePlan(
         weights={
             "volume": "volume",
@@ -122,7 +122,7 @@ STAGES: StageTable = {
             "surface": "surface_joint",
             **MATERIAL_LOSSES,
         },
-        moves=GEOMETRY | MATERIAL,
+        trains=GEOMETRY | MATERIAL,
     ),
 }
 
@@ -228,7 +228,7 @@ def surface_width_limit(config: VolumeConfig, position: StagePosition) -> float:
         0.02
     """
     if config.beta_final == 0.0 or position.stage is Stage.MATERIAL_INIT:
-        # Geometry does not move in material init.
+        # Geometry is not trained in material init.
         return math.inf
     share = position.share if position.stage is Stage.SDF_INIT else 1.0
     first = max(config.beta_init, config.beta_final)
@@ -264,7 +264,7 @@ def active_losses(
     weights |= {
         loss: weights[loss] * getattr(config.loss, setting) ** share for loss, setting in plan.grows.items()
     }
-    if plan.moves_material:
+    if plan.trains_material:
         weights["physical"] = 1.0
         if config.inter_reflection.mode == "soft":
             weights["inter_reflection"] = INTER_REFLECTION

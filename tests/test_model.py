@@ -80,7 +80,7 @@ def test_an_effect_that_is_off_makes_no_queries():
 
 def test_an_image_of_r_evaluates_no_material():
     model = sphere_model().eval()
-    counts = count_queries(model, lambda: model.maps(sphere_batch().rays, with_material=False))
+    counts = count_queries(model, lambda: model.host_maps(sphere_batch().rays))
     assert counts["brdf"] == counts["light"] == 0
 
 

@@ -84,7 +84,7 @@ def test_each_stage_trains_only_its_fields(data: Path, tmp_path: Path, settings:
                 bool(differences(before[key], after[key])) for key in before if key.startswith(prefix)
             )
             there = any(key.startswith(prefix) for key in before)
-            assert changed == (there and field in STAGES[stage].moves), (stage, field)
+            assert changed == (there and field in STAGES[stage].trains), (stage, field)
 
 
 @pytest.mark.parametrize("kind", ["auto", "distant_near"])

@@ -29,7 +29,7 @@ class Compare:
 
 
 def run(options: Compare) -> None:
-    from neilfpp_method.compare.terminal import tables_of
+    from neilfpp_method.compare.terminal import printed_parts
     from neilfpp_method.compare.write import compare_runs
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.train.device import pick_device
@@ -44,10 +44,10 @@ def run(options: Compare) -> None:
             advance,
         )
     console = terminal()
-    for title, table, notes in tables_of(found):
-        console.print(f"\n{title}", style="bold", soft_wrap=True)
-        console.print(table)
-        for note in notes:
+    for part in printed_parts(found):
+        console.print(f"\n{part.title}", style="bold", soft_wrap=True)
+        console.print(part.table)
+        for note in part.notes:
             console.print(f"* {note}", soft_wrap=True)
     for note in found.notes:
         console.print(f"* {note}", soft_wrap=True)

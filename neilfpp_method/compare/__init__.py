@@ -1,5 +1,5 @@
 """Compare runs in a table and an image (docs/compare.md).
 
-`contenders` reads the folders of the runs, `common` selects the views that all runs can render, `figures` and
+`runs` reads the folders of the runs, `common` selects the views that all runs can render, `figures` and
 `parts` build the table, `terminal` prints it, `sheet` draws the image, and `write` is the entry point.
 """

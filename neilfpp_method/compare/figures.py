@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from neilfpp_method.compare.contenders import Contender
-from neilfpp_method.compare.parts import Part, TableRow
+from neilfpp_method.compare.parts import TablePart, TableRow
+from neilfpp_method.compare.runs import ComparedRun
 from neilfpp_method.evaluate.glossary import style_of
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.report.measured import OWN, Measured
@@ -16,7 +16,7 @@ SHOWN = "shown"
 """Name of the part with figures of the rendered views; the names of other parts are protocols."""
 
 
-def figures_parts(runs: Sequence[Contender], other_capture: frozenset[int]) -> list[Part]:
+def figures_parts(runs: Sequence[ComparedRun], other_capture: frozenset[int]) -> list[TablePart]:
     """Build one part of the table for each protocol that at least one run was measured with.
 
     The first run that was measured is the reference for views, size and masks. A run that was measured
@@ -44,11 +44,11 @@ def figure_rows(figures: Sequence[Mapping[str, float]]) -> tuple[TableRow, ...]:
     return tuple(rows)
 
 
-def _part(protocol: str, runs: Sequence[Contender], other_capture: frozenset[int]) -> Part:
+def _part(protocol: str, runs: Sequence[ComparedRun], other_capture: frozenset[int]) -> TablePart:
     measured = [run.files.measured.get(protocol) for run in runs]
     first = next(i for i, figures in enumerate(measured) if figures is not None)
     basis = measured[first]
-    apart, notes = set(other_capture), []
+    not_comparable, notes = set(other_capture), []
     for i, (run, figures) in enumerate(zip(runs, measured, strict=True)):
         if figures is None:
             notes.append(f"{run.label} was not measured: {_command(run, protocol, basis)}")
@@ -59,21 +59,22 @@ def _part(protocol: str, runs: Sequence[Contender], other_capture: frozenset[int
             )
         difference = _difference(runs[first], basis, run, figures) if i != first else ""
         if difference:
-            apart.add(i)
+            not_comparable.add(i)
             notes.append(difference)
     extent = f", {basis.extent}" if basis.extent else ""
     rows = figure_rows([{} if figures is None else figures.figures for figures in measured])
-    return Part("figures", protocol, f"Protocol {protocol}{extent}", rows, frozenset(apart), tuple(notes))
+    title = f"Protocol {protocol}{extent}"
+    return TablePart("figures", protocol, title, rows, frozenset(not_comparable), tuple(notes))
 
 
-def _difference(first: Contender, basis: Measured, run: Contender, figures: Measured) -> str:
+def _difference(first: ComparedRun, basis: Measured, run: ComparedRun, figures: Measured) -> str:
     """Why the figures of a run cannot be compared with those of the first; empty if they can."""
     protocol = basis.protocol
-    for contender, known in ((first, basis), (run, figures)):
+    for measured_run, known in ((first, basis), (run, figures)):
         if not known.extent:
             return (
-                f"{contender.label} was measured by an earlier version, its views and size are not known: "
-                f"{_command(contender, protocol)}"
+                f"{measured_run.label} was measured by an earlier version, its views and size are not known: "
+                f"{_command(measured_run, protocol)}"
             )
     if figures.views != basis.views:
         return (
@@ -94,7 +95,7 @@ def _difference(first: Contender, basis: Measured, run: Contender, figures: Meas
     return ""
 
 
-def _command(run: Contender, protocol: str, basis: Measured | None = None) -> str:
+def _command(run: ComparedRun, protocol: str, basis: Measured | None = None) -> str:
     """The command that measures a run, at the size of `basis` if it is known."""
     option = "" if protocol == OWN else f" --protocol {protocol}"
     width = f" --width {basis.size[0]}" if basis is not None and basis.size else ""

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from neilfpp_method.compare.contenders import Contender
+from neilfpp_method.compare.runs import ComparedRun
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.report.files import flat_settings
 from neilfpp_method.report.tables import STAGE_TITLES
 from neilfpp_method.settings.plain import to_dict
 
-__all__ = ["Part", "TableRow", "runs_part", "seconds_part", "settings_part"]
+__all__ = ["TablePart", "TableRow", "runs_part", "seconds_part", "settings_part"]
 
 Value = float | str | None
 
@@ -38,7 +38,7 @@ class TableRow:
 
 
 @dataclass(frozen=True)
-class Part:
+class TablePart:
     """Rows of the table under one heading.
 
     Attributes:
@@ -46,7 +46,7 @@ class Part:
         name: the protocol of figures; empty for other kinds.
         title: heading for display.
         rows: the rows.
-        apart: indices of the runs whose values cannot be compared with the others.
+        not_comparable: indices of the runs whose values cannot be compared with the others.
         notes: the reasons, and what would make the values comparable.
     """
 
@@ -54,20 +54,20 @@ class Part:
     name: str
     title: str
     rows: tuple[TableRow, ...]
-    apart: frozenset[int] = frozenset()
+    not_comparable: frozenset[int] = frozenset()
     notes: tuple[str, ...] = ()
 
 
-def runs_part(runs: Sequence[Contender]) -> Part:
+def runs_part(runs: Sequence[ComparedRun]) -> TablePart:
     """Build the part that identifies the runs: folder, capture, preset, geometry, steps and health."""
-    lines = {
-        "folder": ("Folder", [str(run.path) for run in runs]),
-        "capture": ("Capture", [run.capture.root.resolve().name for run in runs]),
-        "preset": ("Preset", [run.files.config.preset for run in runs]),
-        "host": ("Geometry", [run.files.config.host.kind for run in runs]),
-        "steps": ("Steps", [f"{run.step} of {run.files.steps}" for run in runs]),
-        "health": ("Health", [_health(run) for run in runs]),
-    }
+    rows = (
+        _text_row("folder", "Folder", [run.path for run in runs]),
+        _text_row("capture", "Capture", [run.capture.root.resolve().name for run in runs]),
+        _text_row("preset", "Preset", [run.files.config.preset for run in runs]),
+        _text_row("host", "Geometry", [run.files.config.host.kind for run in runs]),
+        _text_row("steps", "Steps", [f"{run.step} of {run.files.steps}" for run in runs]),
+        _text_row("health", "Health", [_health(run) for run in runs]),
+    )
     notes = [f"{run.label}: {note}" for run in runs for note in run.files.notes]
     notes += [
         f"{run.label} was stopped before its first checkpoint and cannot be rendered; to continue it: "
@@ -75,22 +75,21 @@ def runs_part(runs: Sequence[Contender]) -> Part:
         for run in runs
         if not run.has_model
     ]
-    rows = tuple(_text_row(key, title, values) for key, (title, values) in lines.items())
-    return Part("runs", "", "Runs", rows, notes=tuple(notes))
+    return TablePart("runs", "", "Runs", rows, notes=tuple(notes))
 
 
-def settings_part(runs: Sequence[Contender]) -> Part:
+def settings_part(runs: Sequence[ComparedRun]) -> TablePart:
     """Build the part with settings, options of reading the capture, and effects that differ between runs."""
     columns = [_settings(run) for run in runs]
     names = list(dict.fromkeys(name for column in columns for name in column))
     differing = [name for name in names if len({str(column.get(name)) for column in columns}) > 1]
     rows = tuple(_text_row(name, name, [column.get(name) for column in columns]) for name in differing)
-    return Part("settings", "", "Settings that differ", rows)
+    return TablePart("settings", "", "Settings that differ", rows)
 
 
-def seconds_part(runs: Sequence[Contender]) -> Part:
+def seconds_part(runs: Sequence[ComparedRun]) -> TablePart:
     """Build the part with seconds by stage, by kind of work, and in total; a note says if machines differ."""
-    stages = [_stages(run) for run in runs]
+    stages = [run.files.seconds for run in runs]
     kinds = [_kinds(run) for run in runs]
     rows = [
         _seconds_row(stage, STAGE_TITLES.get(stage, stage), [column.get(stage) for column in stages])
@@ -108,26 +107,20 @@ def seconds_part(runs: Sequence[Contender]) -> Part:
             "the runs used different machines, so their times cannot be compared: "
             + "; ".join(f"{label} on {machine}" for machine, label in reversed(machines.items()))
         )
-    return Part("seconds", "", "Seconds", tuple(rows), notes=tuple(notes))
+    return TablePart("seconds", "", "Seconds", tuple(rows), notes=tuple(notes))
 
 
-def _health(run: Contender) -> str | None:
+def _health(run: ComparedRun) -> str | None:
     return None if run.files.findings is None else verdict_of(run.files.findings)
 
 
-def _settings(run: Contender) -> dict[str, Any]:
+def _settings(run: ComparedRun) -> dict[str, Any]:
     source = {f"capture.{name}": value for name, value in dataclasses.asdict(run.source).items()}
     effects = {f"effect {row['effect']}": row.get("decision") for row in run.files.effects if "effect" in row}
     return source | flat_settings(to_dict(run.files.config)) | effects
 
 
-def _stages(run: Contender) -> dict[str, float]:
-    if run.files.work:
-        return {stage: sum(parts.values()) for stage, parts in run.files.work.items()}
-    return dict(run.files.timing)
-
-
-def _kinds(run: Contender) -> dict[str, float]:
+def _kinds(run: ComparedRun) -> dict[str, float]:
     totals: dict[str, float] = {}
     for parts in run.files.work.values():
         for kind, seconds in parts.items():
@@ -135,10 +128,9 @@ def _kinds(run: Contender) -> dict[str, float]:
     return totals
 
 
-def _machine(run: Contender) -> str:
+def _machine(run: ComparedRun) -> str:
     machine = run.files.machine
-    gpus = machine.get("gpus")
-    devices = [str(machine.get("processor")), *map(str, gpus if isinstance(gpus, list) else ())]
+    devices = [str(machine.get("processor")), *run.files.gpus]
     return f"{' and '.join(devices)}, {machine.get('threads')} threads" if machine else "an unknown machine"
 
 

@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 
 from neilfpp_method.evaluate.panels import ComparedMap
 from neilfpp_method.evaluate.pictures import Group, PictureRow, Section, contact_sheet
+from neilfpp_method.report.measured import count_of_views
 from neilfpp_method.report.views import title_of
 
 __all__ = ["Column", "comparison_sheet", "shortened"]
@@ -43,8 +44,7 @@ def comparison_sheet(
     for i, view in enumerate(views):
         rows = tuple(_row(name, [maps.get(name) for maps in by_title], i) for name in titles)
         sections.append(Section((Group(f"View {view}", headings),), rows))
-    number = f"{len(views)} views" if len(views) != 1 else "one view"
-    return contact_sheet(title, f"{number} of {len(columns)} runs", sections)
+    return contact_sheet(title, f"{count_of_views(len(views))} of {len(columns)} runs", sections)
 
 
 def shortened(label: str) -> str:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 from rich.table import Table
 from rich.text import Text
 
-from neilfpp_method.compare.parts import Part, TableRow
+from neilfpp_method.compare.parts import TablePart, TableRow
 from neilfpp_method.compare.write import RunComparison
 
-__all__ = ["tables_of"]
+__all__ = ["PrintedPart", "printed_parts"]
 
 ARROWS = {"higher": " ↑", "lower": " ↓", "neither": ""}
 """Suffix of a row's title, which shows whether higher or lower values are better."""
@@ -22,8 +23,17 @@ WIDEST = 28
 """Largest width of a column, characters; longer texts are wrapped."""
 
 
-def tables_of(comparison: RunComparison) -> Iterator[tuple[str, Table, tuple[str, ...]]]:
-    """Yield title, table and notes of each part. The best value among comparable figures is bold."""
+@dataclass(frozen=True)
+class PrintedPart:
+    """A part of the table as it is printed: a title, a table, and notes below it."""
+
+    title: str
+    table: Table
+    notes: tuple[str, ...]
+
+
+def printed_parts(comparison: RunComparison) -> Iterator[PrintedPart]:
+    """Yield the parts that have rows or notes. The best value among comparable figures is bold."""
     texts = [[*comparison.labels], *(row.texts for part in comparison.parts for row in part.rows)]
     widths = [min(max(map(len, column)) + len(MARK), WIDEST) for column in zip(*texts, strict=True)]
     for part in comparison.parts:
@@ -35,22 +45,22 @@ def tables_of(comparison: RunComparison) -> Iterator[tuple[str, Table, tuple[str
             table.add_column(Text(label), justify="right", width=width, overflow="fold")
         for row in part.rows:
             table.add_row(Text(row.title + ARROWS[row.better]), *_cells(part, row))
-        yield part.title, table, part.notes
+        yield PrintedPart(part.title, table, part.notes)
 
 
-def _cells(part: Part, row: TableRow) -> Iterator[Text]:
+def _cells(part: TablePart, row: TableRow) -> Iterator[Text]:
     best = _best(part, row)
     for i, text in enumerate(row.texts):
-        mark = MARK if i in part.apart and row.values[i] is not None else ""
+        mark = MARK if i in part.not_comparable and row.values[i] is not None else ""
         yield Text(text + mark, style="bold" if i in best else "")
 
 
-def _best(part: Part, row: TableRow) -> set[int]:
+def _best(part: TablePart, row: TableRow) -> set[int]:
     """Indices of the comparable runs with the best value; empty if fewer than two values differ."""
     values = {
         i: value
         for i, value in enumerate(row.values)
-        if isinstance(value, float | int) and i not in part.apart
+        if isinstance(value, float | int) and i not in part.not_comparable
     }
     if row.better == "neither" or len(set(values.values())) < 2:
         return set()

@@ -16,15 +16,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neilfpp_method.compare.common import Common, capture_to_show, common_views
-from neilfpp_method.compare.contenders import Contender, read_contenders
+from neilfpp_method.compare.common import CommonViews, capture_to_show, common_views
 from neilfpp_method.compare.figures import SHOWN, figure_rows, figures_parts
-from neilfpp_method.compare.parts import Part, runs_part, seconds_part, settings_part
+from neilfpp_method.compare.parts import TablePart, runs_part, seconds_part, settings_part
+from neilfpp_method.compare.runs import ComparedRun, read_compared_runs
 from neilfpp_method.compare.sheet import Column, comparison_sheet
 from neilfpp_method.data.images import replacing, write_png
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
-from neilfpp_method.report.views import ComparedViews, compare_views
+from neilfpp_method.report.measured import count_of_views
+from neilfpp_method.report.views import MAX_SIZE, MAX_VIEWS, MIN_SIZE, ComparedViews, compare_views
 from neilfpp_method.train.output import check_writable
 from neilfpp_method.train.run import load_run
 
@@ -33,10 +34,6 @@ __all__ = ["FILES", "RunComparison", "compare_runs"]
 FILES = ("compare.json", "compare.csv", "compare.png")
 FORMAT = 1
 """Version of the format of compare.json."""
-MAX_VIEWS = 64
-"""Largest number of views in the image."""
-MIN_SIZE, MAX_SIZE = 16, 2048
-"""Smallest and largest longest side of a rendered view, pixels."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,7 @@ class RunComparison:
     """The result of a comparison: a label per run, the parts of the table, notes, and the files written."""
 
     labels: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[TablePart, ...]
     notes: tuple[str, ...]
     files: tuple[Path, ...]
 
@@ -76,10 +73,10 @@ def compare_runs(
     if not MIN_SIZE <= size <= MAX_SIZE:
         raise UserError(f"cannot render views of {size} pixels", f"give {MIN_SIZE} to {MAX_SIZE} with --size")
     check_writable(out / FILES[0])
-    runs = read_contenders(paths)
+    runs = read_compared_runs(paths)
     common = common_views(runs, views, size)
     rendered = _render(runs, common, device, on_progress) if common.names else {}
-    parts = [runs_part(runs), settings_part(runs), *figures_parts(runs, common.apart)]
+    parts = [runs_part(runs), settings_part(runs), *figures_parts(runs, common.other_capture)]
     if rendered:
         parts.append(_rendered_part(runs, common, rendered))
     parts.append(seconds_part(runs))
@@ -88,7 +85,7 @@ def compare_runs(
 
 
 def _render(
-    runs: Sequence[Contender], common: Common, device: str, on_progress: Callable[[float], None]
+    runs: Sequence[ComparedRun], common: CommonViews, device: str, on_progress: Callable[[float], None]
 ) -> dict[int, ComparedViews]:
     """Render the common views of each run that has a model, by index; one model is in memory at a time."""
     with_model = [i for i, run in enumerate(runs) if run.has_model]
@@ -100,7 +97,9 @@ def _render(
     return rendered
 
 
-def _rendered_part(runs: Sequence[Contender], common: Common, rendered: Mapping[int, ComparedViews]) -> Part:
+def _rendered_part(
+    runs: Sequence[ComparedRun], common: CommonViews, rendered: Mapping[int, ComparedViews]
+) -> TablePart:
     """Figures of the views in the image: the same views at the same size for all runs."""
     rows = figure_rows([rendered[i].figures if i in rendered else {} for i in range(len(runs))])
     sources = {views.mask_source for views in rendered.values()}
@@ -111,9 +110,8 @@ def _rendered_part(runs: Sequence[Contender], common: Common, rendered: Mapping[
             "capture would make all runs count the same pixels"
         )
     trained = "" if common.held_out else ", used in training"
-    number = f"{len(common.names)} views" if len(common.names) != 1 else "one view"
-    title = f"The image's {number}, longest side {common.longest} pixels{trained}"
-    return Part("figures", SHOWN, title, rows, notes=tuple(notes))
+    title = f"The image's {count_of_views(len(common.names))}, longest side {common.longest} pixels{trained}"
+    return TablePart("figures", SHOWN, title, rows, notes=tuple(notes))
 
 
 # ------------------------------------------------------------------------------------------------------ files
@@ -122,8 +120,8 @@ def _rendered_part(runs: Sequence[Contender], common: Common, rendered: Mapping[
 def _write(
     comparison: RunComparison,
     out: Path,
-    common: Common,
-    runs: Sequence[Contender],
+    common: CommonViews,
+    runs: Sequence[ComparedRun],
     rendered: Mapping[int, ComparedViews],
 ) -> tuple[Path, ...]:
     json_file, csv_file, image_file = (out / name for name in FILES)
@@ -140,7 +138,7 @@ def _write(
     return (json_file, csv_file, image_file) if rendered else (json_file, csv_file)
 
 
-def _plain(comparison: RunComparison, common: Common) -> dict[str, Any]:
+def _plain(comparison: RunComparison, common: CommonViews) -> dict[str, Any]:
     """The table as plain values for JSON; numbers are not rounded."""
     parts = [
         {
@@ -148,7 +146,7 @@ def _plain(comparison: RunComparison, common: Common) -> dict[str, Any]:
             "name": part.name,
             "title": part.title,
             "notes": list(part.notes),
-            "apart": [comparison.labels[i] for i in sorted(part.apart)],
+            "apart": [comparison.labels[i] for i in sorted(part.not_comparable)],
             "rows": {
                 row.key: {
                     "title": row.title,
@@ -179,8 +177,8 @@ def _csv(comparison: RunComparison) -> str:
     writer.writerow(["kind", "name", "key", *comparison.labels])
     for part in comparison.parts:
         if part.kind == "figures":
-            apart = ["no" if i in part.apart else "yes" for i in range(len(comparison.labels))]
-            writer.writerow([part.kind, part.name, "comparable", *apart])
+            answers = ["no" if i in part.not_comparable else "yes" for i in range(len(comparison.labels))]
+            writer.writerow([part.kind, part.name, "comparable", *answers])
         for row in part.rows:
             values = ["" if value is None else value for value in row.values]
             writer.writerow([part.kind, part.name, row.key, *values])

@@ -39,6 +39,7 @@ from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
 __all__ = [
+    "DISPLAY_STEP",
     "TrainingResiduals",
     "deviations_at",
     "material_deviation",
@@ -47,6 +48,8 @@ __all__ = [
     "with_deviation",
 ]
 
+DISPLAY_STEP = 2
+"""Step of `with_deviation` for images that are only displayed: a quarter of the time."""
 VIEWS = 16
 """Largest number of training views used per point. Further views lie between these and add little."""
 DIRECT, REFLECTED, OVERALL = 0.3, 0.2, 1.0

@@ -143,7 +143,7 @@ def style_of(name: str) -> FigureStyle:
     """Look up how a figure is displayed.
 
     A `baseline_` figure and a `_frame` figure get the entry of their base figure with a changed title. An
-    unknown figure gets its own name as title.
+    unknown figure gets its own name as title, and neither higher nor lower values count as better.
     """
     if name in STYLES:
         return STYLES[name]
@@ -159,4 +159,4 @@ def style_of(name: str) -> FigureStyle:
         return replace(
             masked, title=f"{masked.title}, whole frame", meaning="The background counts as free of error."
         )
-    return FigureStyle(name.replace("_", " ").capitalize(), "%.4g", "higher", "")
+    return FigureStyle(name.replace("_", " ").capitalize(), "%.4g", "neither", "")

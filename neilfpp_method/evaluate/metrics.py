@@ -22,6 +22,7 @@ __all__ = [
     "angular_error",
     "chamfer",
     "confidence_ratio",
+    "decibels",
     "log_error",
     "log_ratio",
     "median_scale",
@@ -63,7 +64,7 @@ def psnr(
 
     10 log10(peak² / MSE), the squared error averaged over masked pixels and channels; at most 100 dB.
     """
-    return _decibels(_squared_error(estimate, truth)[mask].mean(), peak)
+    return decibels(_squared_error(estimate, truth)[mask].mean(), peak)
 
 
 def psnr_frame(
@@ -76,7 +77,7 @@ def psnr_frame(
 
     It exceeds `psnr` by 10 log10(all pixels / masked pixels), up to the limit of 100 dB.
     """
-    return _decibels((_squared_error(estimate, truth) * mask[..., None]).mean(), peak)
+    return decibels((_squared_error(estimate, truth) * mask[..., None]).mean(), peak)
 
 
 def ssim(
@@ -119,7 +120,8 @@ def _squared_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.square(a.astype(np.float64) - b.astype(np.float64))
 
 
-def _decibels(squared_error: float, peak: float) -> float:
+def decibels(squared_error: float, peak: float = 1.0) -> float:
+    """Peak signal-to-noise ratio of a mean squared error, dB; at most 100 dB."""
     return float(-10.0 * np.log10(max(squared_error / peak**2, PERFECT)))
 
 

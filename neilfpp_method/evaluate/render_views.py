@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.views import RenderedView, render_view
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["render_run"]
 
@@ -53,8 +52,8 @@ def render_run(
         UserError: the capture has no such view, or `confidence` is set and the run has no material yet.
     """
     names = {view.name for view in run.capture.chosen_views(views)}
-    if confidence and not run.has_material:
-        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
+    if confidence:
+        check_material(run)
     residuals = measure_residuals(run) if confidence else None
     written = []
     for i, view in enumerate(run.capture.views):

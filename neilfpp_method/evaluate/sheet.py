@@ -6,23 +6,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from neilfpp_method.data.images import write_png
-from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
+from neilfpp_method.evaluate.confidence import DISPLAY_STEP, measure_residuals, with_deviation
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.panels import albedo_scale, view_sections
 from neilfpp_method.evaluate.pictures import contact_sheet
-from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
-from neilfpp_method.schedule import stage_steps
+from neilfpp_method.evaluate.views import RenderedView, evenly_spread, known_test_views, render_view
+from neilfpp_method.schedule import total_steps
 from neilfpp_method.train.run import Run
 
 __all__ = ["write_contact_sheet", "write_light_picture"]
 
 SHOWN_VIEWS = 3
 """Number of views on a contact sheet."""
-CONFIDENCE_STEP = 2
-"""Expected errors are computed for every n-th pixel of every n-th row, to save time."""
 
 
 def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] = ()) -> None:
@@ -43,11 +39,11 @@ def write_contact_sheet(run: Run, path: Path, rendered: Sequence[RenderedView] =
     scale = albedo_scale(rendered, known) if run.has_material else None
     if run.has_material and run.capture.train_views:
         residuals = measure_residuals(run)
-        rendered = [with_deviation(run, residuals, view, CONFIDENCE_STEP) for view in rendered]
+        rendered = [with_deviation(run, residuals, view, DISPLAY_STEP) for view in rendered]
     views = view_sections(displayed, rendered, known, scale)
     light = light_sections(displayed, rendered, scale) if run.has_material else []
     title = f"{run.capture.root.resolve().name}, {run.config.preset}"
-    subtitle = f"step {run.step} of {sum(stage_steps(run.config.train).values())}"
+    subtitle = f"step {run.step} of {total_steps(run.config.train)}"
     write_png(path, contact_sheet(title, subtitle, [*views, *light]))
 
 
@@ -67,5 +63,5 @@ def write_light_picture(run: Run, path: Path) -> bool:
 def _with_displayed_views(run: Run) -> Run:
     """The run with up to three test views, chosen evenly from its test views or else its training views."""
     views = run.capture.test_views or run.capture.train_views
-    rows = np.linspace(0, len(views) - 1, SHOWN_VIEWS).round().astype(int)
-    return replace(run, capture=replace(run.capture, test=frozenset(views[row].name for row in rows)))
+    names = evenly_spread([view.name for view in views], SHOWN_VIEWS)
+    return replace(run, capture=replace(run.capture, test=frozenset(names)))

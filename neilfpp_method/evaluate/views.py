@@ -24,6 +24,7 @@ __all__ = [
     "HeldOut",
     "KnownView",
     "RenderedView",
+    "evenly_spread",
     "known_test_views",
     "mask_source",
     "mean_observed_color",
@@ -59,18 +60,28 @@ def render_view(
     each. If the run has no material yet, `rgb` is the host's colour, and the maps of the material are 0.
     """
     view = run.capture.views[view_index]
-    device = run.device
+    device, render = run.device, run.model.maps if run.has_material else run.model.host_maps
     rays = camera_rays(run.capture.scene_camera(view))
     parts = -(-len(rays) // EVAL_RAYS)
     combined: dict[str, Tensor] = {}
     for k in range(parts):
         rows = torch.arange(k, len(rays), parts)
-        maps = run.model.maps(rays[rows].to(device), run.has_material)
+        maps = render(rays[rows].to(device))
         for name in (f.name for f in fields(Maps)):
             values = getattr(maps, name).float().cpu()
             combined.setdefault(name, values.new_empty(len(rays), values.shape[1]))[rows] = values
         on_progress((k + 1) / parts)
     return RenderedView(view.name, {name: _image(values, view) for name, values in combined.items()})
+
+
+def evenly_spread(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """Choose `count` of the names at even distances, or all if there are fewer.
+
+    >>> evenly_spread("abcde", 3)
+    ('a', 'c', 'e')
+    """
+    rows = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+    return tuple(names[row] for row in rows)
 
 
 def render_test_views(

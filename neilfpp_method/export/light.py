@@ -22,6 +22,7 @@ from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.probes import probe, spread_over_surface
 from neilfpp_method.fields.environment import EnvironmentLight
+from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import Run
 
 __all__ = ["ExportedLight", "check_light", "export_light", "lamps_in_world"]
@@ -66,20 +67,24 @@ def export_light(run: Run, out: Path, probes: int | None = None) -> ExportedLigh
         probes: number of probes; None for 16 if the light is free, else 0.
 
     Raises:
-        UserError: `check_light` fails, or there is no surface for probes.
+        UserError: `check_light` fails, or there is no surface for probes; then nothing is written. Or a file
+            cannot be written.
     """
     check_light(run, probes)
     light, lamps, environment = run.model.light, 0, None
+    if probes is None:
+        probes = 0 if isinstance(light, EnvironmentLight) else FREE_PROBES
+    # Chosen before anything is written, because there may be no surface.
+    points = spread_over_surface(run, probes) if probes else None
     if isinstance(light, EnvironmentLight):
         environment = out / "environment.exr"
         write_exr(environment, {"RGB": light.log_radiance.exp().permute(1, 2, 0).cpu().numpy()})
         entries = lamps_in_world(run)
         lamps = len(entries)
         write_json(out / "lamps.json", {"format": FORMAT, "frame": "world", "lamps": entries})
-    if probes is None:
-        probes = 0 if environment else FREE_PROBES
-    written = _write_probes(run, out, probes) if probes else 0
-    return ExportedLight(environment, lamps, written)
+    if points is not None:
+        _write_probes(run, out, points)
+    return ExportedLight(environment, lamps, 0 if points is None else len(points))
 
 
 def lamps_in_world(run: Run) -> list[dict[str, Any]]:
@@ -108,8 +113,7 @@ def lamps_in_world(run: Run) -> list[dict[str, Any]]:
     ]
 
 
-def _write_probes(run: Run, out: Path, count: int) -> int:
-    points = spread_over_surface(run, count)
+def _write_probes(run: Run, out: Path, points: OrientedPoints) -> None:
     entries = []
     for position, normal in zip(points.position, points.normal, strict=True):
         name = f"probes/{len(entries):04d}.exr"
@@ -117,7 +121,6 @@ def _write_probes(run: Run, out: Path, count: int) -> int:
         entries.append({"file": name, "position": _in_world(run, position), "normal": normal.tolist()})
     # Written last, so that all files which it lists exist.
     write_json(out / "probes.json", {"format": FORMAT, "frame": "world", "probes": entries})
-    return len(entries)
 
 
 def _in_world(run: Run, position: Float[Tensor, " 3"]) -> list[float]:

@@ -72,7 +72,7 @@ def surface_mesh(
             f"{run.path}: the host of this run has no distance field and no mesh",
             "use a run of the VolSDF or mesh host",
         )
-    return extracted_surface(run, resolution, shaded=False, say=say).mesh()
+    return extracted_surface(run, resolution, say).mesh()
 
 
 def export_mesh(

@@ -27,7 +27,15 @@ from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
 from neilfpp_method.hosts.volsdf import HIT_RADIUS, VolSdfHost
 from neilfpp_method.train.run import Run
 
-__all__ = ["ExtractedSurface", "extracted_surface", "read_surface", "shading_normals", "write_surface"]
+__all__ = [
+    "ExtractedSurface",
+    "ShadedSurface",
+    "extracted_surface",
+    "read_surface",
+    "shaded_surface",
+    "shading_normals",
+    "write_surface",
+]
 
 FORMAT = 1
 """Version of the file."""
@@ -50,12 +58,17 @@ class ExtractedSurface:
         return trimesh.Trimesh(self.vertices, self.faces, process=False)
 
 
+@dataclass(frozen=True)
+class ShadedSurface:
+    """Triangles in the scene frame, oriented outwards, with unit shading normals at the vertices."""
+
+    vertices: Float32[np.ndarray, "V 3"]
+    faces: Int32[np.ndarray, "F 3"]
+    normals: Float32[np.ndarray, "V 3"]
+
+
 def extracted_surface(
-    run: Run,
-    resolution: int,
-    shaded: bool,
-    say: Callable[[str], None] = lambda text: None,
-    keep: bool = True,
+    run: Run, resolution: int, say: Callable[[str], None] = lambda text: None, keep: bool = True
 ) -> ExtractedSurface:
     """Return the zero set of the distance field of a run, from the file in the run folder if there is one.
 
@@ -65,19 +78,35 @@ def extracted_surface(
     Args:
         run: a run whose host has a distance field.
         resolution: resolution of `extract_mesh`.
-        shaded: whether shading normals are needed.
         say: receives a line if a file is replaced, or cannot be written.
         keep: whether a surface that had to be computed is written.
 
     Raises:
         UserError: the field has no zero set, or its grid does not fit in memory.
     """
+    return _kept(run, resolution, lambda surface: surface, say, keep)
+
+
+def shaded_surface(
+    run: Run, resolution: int, say: Callable[[str], None] = lambda text: None, keep: bool = True
+) -> ShadedSurface:
+    """As `extracted_surface`, with the normals that the run uses for shading."""
+    surface = _kept(run, resolution, lambda surface: _with_normals(run, surface), say, keep)
+    return ShadedSurface(surface.vertices, surface.faces, surface.normals)
+
+
+def _kept(
+    run: Run,
+    resolution: int,
+    complete: Callable[[ExtractedSurface], ExtractedSurface],
+    say: Callable[[str], None],
+    keep: bool,
+) -> ExtractedSurface:
+    """Read or extract a surface, add what it lacks by `complete`, and write it unless it is unchanged."""
     path = run.path / "cache" / f"surface-{resolution}.npz"
     made_from = _fingerprint(run, resolution)
     stored = None if made_from is None else read_surface(path, made_from, say)
-    surface = stored or _extract(run, resolution)
-    if shaded and surface.normals is None:
-        surface = _with_normals(run, surface)
+    surface = complete(stored or _extract(run, resolution))
     if keep and made_from is not None and surface is not stored:
         try:
             write_surface(path, surface, made_from)
@@ -112,6 +141,9 @@ def _extract(run: Run, resolution: int) -> ExtractedSurface:
 
 
 def _with_normals(run: Run, surface: ExtractedSurface) -> ExtractedSurface:
+    """The surface with shading normals; the same object if it has them."""
+    if surface.normals is not None:
+        return surface
     position, normal = (
         torch.from_numpy(np.array(values, np.float32)).to(run.device)
         for values in (surface.vertices, surface.mesh().vertex_normals)

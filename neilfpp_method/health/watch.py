@@ -55,7 +55,7 @@ class Watch:
 
     def after_step(self, plan: StagePlan, computed: StepResult, step: int) -> None:
         """Check whether a step had surface points to shade."""
-        if not plan.moves_material:
+        if not plan.trains_material:
             return
         self.empty_steps = 0 if len(computed.surface_rows) else self.empty_steps + 1
         self._replace([NOTHING_SHADED], nothing_shaded(self.empty_steps, step))
@@ -66,7 +66,7 @@ class Watch:
 
     def after_stage(self, model: NeilfModel, plan: StagePlan, skipped: int, step: int) -> None:
         """Measure and check the surface, and the material in a stage that trains it."""
-        self.judge(measure_surface(model, self.pixels, plan.moves_material), skipped, step)
+        self.judge(measure_surface(model, self.pixels, plan.trains_material), skipped, step)
 
     def judge(self, measured: SurfaceMeasurement, skipped: int, step: int) -> None:
         """Check a measurement and the number of steps skipped so far."""

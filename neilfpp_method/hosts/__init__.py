@@ -5,6 +5,6 @@
 
 Hosts of other projects are recognised by `adapt` (a `function`, a `nerfstudio` model, whole images by
 `image`) and wrapped by `foreign`, with a `proxy` for rays that they cannot trace. Their batches and outputs
-are converted and checked (`batches`, `answers`, `outputs`, `first_batches`). `testing` checks a host for its
-author.
+are converted and checked (`batches`, `conversion`, `outputs`, `first_batches`). `testing` checks a host for
+its author.
 """

@@ -46,7 +46,7 @@ class Host(Protocol):
     """
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Color, hit position and normal of each ray, differentiable in the host's parameters."""
+        """Colour, hit position and normal of each ray, differentiable in the host's parameters."""
         ...
 
 
@@ -111,7 +111,7 @@ class HasRadiance(Protocol):
 
 @runtime_checkable
 class ReadsOutputs(Protocol):
-    """A host whose renderer returns its own dictionary. Without it the names of `hosts.answers` apply."""
+    """A host whose renderer returns its own dictionary. Without it the names of `hosts.conversion` apply."""
 
     def read_outputs(self, rays: RayBatch, outputs: Mapping[str, Tensor]) -> SurfaceHits:
         """Convert the dictionary that the host's renderer returned for these rays to hits."""

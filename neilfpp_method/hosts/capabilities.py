@@ -114,8 +114,8 @@ CAPABILITIES = (
         "read_outputs",
         base.ReadsOutputs,
         "`losses` and `maps`, if they are given rendered outputs",
-        "hosts.answers",
-        "a dictionary is read by common names (`hosts.answers`)",
+        "hosts.conversion",
+        "a dictionary is read by common names (`hosts.conversion`)",
     ),
     Capability(
         "stages",

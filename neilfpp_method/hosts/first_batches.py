@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.other_viewpoints import OtherViewpoints, other_viewpoints
+from neilfpp_method.hosts.other_viewpoints import CLOSE, SAME_POINT, OtherViewpoints, other_viewpoints
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import OrientedPoints, PixelBatch, RayBatch, SurfaceHits
@@ -44,12 +44,8 @@ BACKGROUND_MISSES = "give its rays a concentration of 0, and for a function a no
 """Remedy for a background that counts as a surface."""
 MAX_REVIEWED_HITS = 256
 """Maximum number of hits that are rendered from another viewpoint, once."""
-MAX_DISTANCE = 0.01
-"""Largest distance between the hits of one point from two viewpoints, scene units, as in `check_host`."""
-MAX_DISTANT_SHARE = 0.4
-"""Largest share of points that may be farther apart; some are occluded from the other viewpoint."""
-CLOSE = 0.05
-"""Distance from a hit at which rays start in the search for a near plane, as in `check_host`."""
+MAX_MOVED_SHARE = 0.4
+"""Largest share of hits that may be lost or elsewhere when seen from another viewpoint; some are occluded."""
 MAX_MEDIAN_RATIO = 30.0
 """Factor between the median of the pixels and `median_radiance` above which one of them is probably wrong."""
 
@@ -65,8 +61,8 @@ class FirstBatches:
         facts: meaning of pixel values, and median linear luminance of the object.
         render: renders any rays with the host, to compare its hits from two viewpoints; if None, they are not
             compared.
-        near_too: whether to compare them from close by as well, since the host itself renders rays that start
-            on its surface.
+        traced_by_host: whether the host itself renders the rays that start on its surface. If so, its hits
+            are compared from close by as well.
     """
 
     def __init__(
@@ -75,13 +71,13 @@ class FirstBatches:
         hit_share: float,
         facts: SceneFacts,
         render: Callable[[RayBatch], SurfaceHits] | None = None,
-        near_too: bool = False,
+        traced_by_host: bool = False,
     ) -> None:
         self.name = name
         self.hit_share = hit_share
         self.facts = facts
         self.render = render
-        self.near_too = near_too
+        self.traced_by_host = traced_by_host
         self.batches = 0
         self.any_hit = False
         self._warned: set[str] = set()
@@ -228,17 +224,17 @@ class FirstBatches:
         rows = torch.nonzero(hit)[:, 0]
         rows = rows[:: math.ceil(len(rows) / MAX_REVIEWED_HITS)]
         others = other_viewpoints(batch.rays[rows], OrientedPoints(hits.position[rows], hits.normal[rows]))
-        moved = self._moved(others, others.distance, render)
-        if moved > MAX_DISTANT_SHARE:
+        moved = self._share_moved(others, others.distance, render)
+        if moved > MAX_MOVED_SHARE:
             self._warn(
                 "moved",
-                f"{moved:.0%} of its hits are {MAX_DISTANCE} or more away when seen from another viewpoint",
+                f"{moved:.0%} of its hits are {SAME_POINT} or more away when seen from another viewpoint",
                 "return distances along the unit ray, not z-depths; a host that is still being trained may "
                 "have no surface yet",
             )
-        elif self.near_too:
-            moved = self._moved(others, torch.full_like(others.distance, CLOSE), render)
-            if moved > MAX_DISTANT_SHARE:
+        elif self.traced_by_host:
+            moved = self._share_moved(others, torch.full_like(others.distance, CLOSE), render)
+            if moved > MAX_MOVED_SHARE:
                 self._warn(
                     "near plane",
                     f"{moved:.0%} of its hits are lost when seen from {CLOSE} away, and so is the light that "
@@ -247,14 +243,14 @@ class FirstBatches:
                     "to 'hard', so that a proxy of the surface traces them (docs/hosts.md)",
                 )
 
-    def _moved(
+    def _share_moved(
         self, others: OtherViewpoints, distance: Tensor, render: Callable[[RayBatch], SurfaceHits]
     ) -> float:
         """The share of hits that are lost or elsewhere when they are rendered from these distances."""
         with torch.random.fork_rng(devices=[distance.device] if distance.is_cuda else []):
             again = render(others.rays(distance))
         offset = (again.position - others.position).norm(dim=-1)
-        same = again.is_hit(self.hit_share) & (offset < MAX_DISTANCE)
+        same = again.is_hit(self.hit_share) & (offset < SAME_POINT)
         return 1.0 - same.float().mean().item()
 
     def _warn(self, kind: str, problem: str, remedy: str) -> None:

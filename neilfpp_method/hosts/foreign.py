@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits, given_depth, no_hits
 from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
+from neilfpp_method.hosts.conversion import as_hits, given_depth, no_hits
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -99,7 +99,7 @@ class ForeignHost(nn.Module):
             return self.proxy.render(rays)
         if not hasattr(self.inner, "render"):
             return self.camera_hits(rays)
-        return self.read(rays, self._answer(rays))
+        return self.read(rays, self._call(rays))
 
     def camera_hits(self, rays: RayBatch) -> SurfaceHits:
         """Hits of camera rays by the host itself.
@@ -112,7 +112,7 @@ class ForeignHost(nn.Module):
                 f"{self.name} draws whole images, not rays",
                 "pass its hits: losses(batch, step, hits) and maps(rays, hits), see docs/hosts.md",
             )
-        return no_hits(rays) if len(rays) == 0 else self.read(rays, self._answer(rays))
+        return no_hits(rays) if len(rays) == 0 else self.read(rays, self._call(rays))
 
     def image_hits(self, camera: Camera, rays: RayBatch) -> SurfaceHits:
         """The hits of all pixels of a camera, whose rays are given, by a host that draws whole images.
@@ -127,14 +127,14 @@ class ForeignHost(nn.Module):
         return self.read(rays, self.inner.render_image(camera))
 
     def read(self, rays: RayBatch, rendered: object) -> SurfaceHits:
-        """Convert what the host rendered for these rays, in any form that `hosts.answers` reads.
+        """Convert what the host rendered for these rays, in any form that `hosts.conversion` reads.
 
         Raises:
             UserError: it cannot be converted.
         """
         return self._precise(rays, as_hits(self.inner, rays, rendered), given_depth(rendered))
 
-    def show_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
+    def update_proxy(self, rays: RayBatch, hits: SurfaceHits) -> None:
         """Add the camera rays of a training step to the proxy; the first call also explores the surface."""
         if self.proxy is None or len(rays) == 0:
             return
@@ -148,9 +148,9 @@ class ForeignHost(nn.Module):
         rendered = self.inner.render_regularized(batch, names)
         return RegularizedHits(self.read(batch.rays, rendered.hits), rendered.terms)
 
-    def _answer(self, rays: RayBatch) -> object:
+    def _call(self, rays: RayBatch) -> object:
         """What the host returns; that of a function is not converted yet, so that its depths are seen."""
-        return self.inner.answer(rays) if isinstance(self.inner, CallableHost) else self.inner.render(rays)
+        return self.inner.call(rays) if isinstance(self.inner, CallableHost) else self.inner.render(rays)
 
     def _precise(self, rays: RayBatch, hits: SurfaceHits, depth: Tensor | None) -> SurfaceHits:
         for name, value in (("position", hits.position), ("depth", depth)):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from neilfpp_method.hosts.answers import Rendered, as_hits
+from neilfpp_method.hosts.conversion import Rendered, as_hits
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["CallableHost", "RenderFunction"]
@@ -18,8 +18,8 @@ class CallableHost:
     """Makes a host of a function (origins, directions) → (color, position, normal).
 
     A ray whose normal is shorter than ½ or not finite is a miss. The function may return a dictionary or
-    `SurfaceHits` instead, which is read as `hosts.answers` says. This class is not an `nn.Module`, so that a
-    function that is one is not registered as a submodule.
+    `SurfaceHits` instead, which is read as `hosts.conversion` says. This class is not an `nn.Module`, so that
+    a function that is one is not registered as a submodule.
     """
 
     def __init__(self, function: RenderFunction) -> None:
@@ -32,8 +32,8 @@ class CallableHost:
         Raises:
             UserError: it does not return tensors of the right shape on the device of the rays.
         """
-        return as_hits(self, rays, self.answer(rays))
+        return as_hits(self, rays, self.call(rays))
 
-    def answer(self, rays: RayBatch) -> object:
+    def call(self, rays: RayBatch) -> object:
         """What the function returns for these rays, unchanged and unchecked."""
         return self.function(rays.origins, rays.directions)

@@ -17,7 +17,14 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import (
+    TINY,
+    FirstHits,
+    face_normals,
+    first_hits_of,
+    intersect_planes,
+    normals_towards_viewer,
+)
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
@@ -32,8 +39,6 @@ SAME_MESH = 1e-6
 """Difference of fingerprints up to which two meshes are the same. Rounding on another processor changes them
 by about 1e-8.
 """
-TINY = 1e-18
-"""Length below which a cross product of edges has no direction; tiny, as triangles may be small."""
 CREASE = math.radians(40)
 """Angle between the normals of two faces above which their common edge is sharp; otherwise normals are
 interpolated across it.
@@ -43,8 +48,8 @@ RADIANCE_AT_ONCE = 2**16
 
 
 @dataclass(frozen=True)
-class Crossings:
-    """Rays that hit the mesh: their rows, hit positions and normals, and whether they hit the outside."""
+class MeshHits:
+    """Rays that hit the mesh: rows, positions and normals of the hits, and whether they hit the outside."""
 
     rows: Int[Tensor, " K"]
     position: Float[Tensor, "K 3"]
@@ -74,8 +79,7 @@ class MeshHost(nn.Module):
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
         triangles = mesh.vertices[mesh.faces]
-        across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-        outward = safe_normalize(across, eps=TINY)
+        outward = face_normals(triangles)
         smooth = corner_normals(mesh, outward)
         self.register_buffer("triangles", triangles, persistent=False)
         self.register_buffer("outward", outward, persistent=False)
@@ -107,7 +111,7 @@ class MeshHost(nn.Module):
     def render(self, rays: RayBatch) -> SurfaceHits:
         """First hit of each ray with R there; the background for a ray that misses."""
         with torch.no_grad():
-            hit = self.cross(rays)
+            hit = self.intersect(rays)
         wo = -rays.directions[hit.rows]
         radiance = self.radiance_field(hit.position, wo, hit.normal, hit.position[:, :0])
         nothing, zeros = torch.zeros_like(rays.origins), torch.zeros_like(rays.origins[:, 0])
@@ -124,7 +128,7 @@ class MeshHost(nn.Module):
         """R where rays from x along wi hit the mesh; the inside of the mesh stops rays and is black."""
         directions = wi.reshape(-1, 3)
         origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
-        hit = self.cross(RayBatch(origins, directions))
+        hit = self.intersect(RayBatch(origins, directions))
         radiance, distance = torch.zeros_like(directions), torch.full_like(directions[:, 0], torch.inf)
         distance[hit.rows] = (hit.position - origins[hit.rows]).norm(dim=-1)
         outside = torch.nonzero(hit.outside)[:, 0]
@@ -146,7 +150,7 @@ class MeshHost(nn.Module):
         up = normal.repeat_interleave(NEIGHBORS, 0)
 
         def normals_below(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-            hit = self.cross(RayBatch(x + self.normal_radius * up, -up))
+            hit = self.intersect(RayBatch(x + self.normal_radius * up, -up))
             return torch.zeros_like(x).index_put((hit.rows,), hit.normal * hit.outside[:, None])
 
         return smooth_normals(normals_below, position, normal, self.normal_radius)
@@ -160,31 +164,28 @@ class MeshHost(nn.Module):
 
     # ----------------------------------------------------------------------------------------------- geometry
 
-    def cross(self, rays: RayBatch) -> Crossings:
+    def intersect(self, rays: RayBatch) -> MeshHits:
         """First hits of rays with the mesh, on either side."""
         numbers = self._first_hits()(rays.origins, rays.directions)
         rows = torch.nonzero(numbers >= 0)[:, 0]
         numbers, origins, directions = numbers[rows], rays.origins[rows], rays.directions[rows]
-        meeting = meet(origins, directions, self.triangles[numbers].to(origins.dtype))
+        on_plane = intersect_planes(origins, directions, self.triangles[numbers].to(origins.dtype))
         flat = self.outward[numbers].to(origins.dtype)
         smooth = safe_normalize(
-            (meeting.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
+            (on_plane.weights[..., None] * self.corner_normals[numbers].to(origins.dtype)).sum(1)
         )
-        # At grazing angles the interpolated normal can face away from the viewer; then use the triangle's.
-        faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0.0
-        return Crossings(
+        return MeshHits(
             rows=rows,
-            position=origins + meeting.distance[:, None] * directions,
-            normal=torch.where(faces_viewer, smooth, flat),
+            position=origins + on_plane.distance[:, None] * directions,
+            normal=normals_towards_viewer(smooth, flat, directions),
             outside=(flat * directions).sum(-1) < 0.0,
         )
 
     def _first_hits(self) -> FirstHits:
-        """The tracer of the current device, made at first use: Embree on a CPU if installed, else a tree."""
+        """The tracer of the current device, made at first use."""
         device = self.triangles.device
         if device not in self._tracers:
-            embree = embree_tracer(self.triangles) if device.type == "cpu" else None
-            self._tracers[device] = embree or tree_tracer(build_tree(self.triangles))
+            self._tracers[device] = first_hits_of(self.triangles)
         return self._tracers[device]
 
     def _background(self, rays: RayBatch, hit_rows: Int[Tensor, " K"]) -> Float[Tensor, "N 3"]:

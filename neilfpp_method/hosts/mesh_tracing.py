@@ -1,6 +1,6 @@
 """First hits of rays with triangles: by tensor operations on the device of the rays, or by Embree on a CPU.
 
-Both return the triangle that each ray hits first; `meet` computes where.
+Both return the triangle that each ray hits first; `intersect_planes` computes where.
 """
 
 from __future__ import annotations
@@ -14,11 +14,27 @@ import trimesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-__all__ = ["BoxTree", "FirstHits", "Meeting", "build_tree", "embree_tracer", "meet", "tree_tracer"]
+from neilfpp_method.shading.frame import safe_normalize
+
+__all__ = [
+    "TINY",
+    "BoxTree",
+    "FirstHits",
+    "PlaneHits",
+    "build_tree",
+    "embree_tracer",
+    "face_normals",
+    "first_hits_of",
+    "intersect_planes",
+    "normals_towards_viewer",
+    "tree_tracer",
+]
 
 FirstHits = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], Int[Tensor, " N"]]
 """Maps origins and unit directions to the index of the triangle that each ray hits first, −1 for a miss."""
 
+TINY = 1e-18
+"""Length below which a cross product of edges has no direction; tiny, because triangles may be small."""
 BRANCHES = 8
 """Children per node of the tree."""
 MORTON_BITS = 20
@@ -33,17 +49,41 @@ MIN_COMPONENT = 1e-12
 """Lower bound on the size of a direction's components, so that their inverses are finite."""
 
 
+def first_hits_of(triangles: Float[Tensor, "F 3 3"]) -> FirstHits:
+    """Make a tracer on the device of the triangles: Embree on a CPU if it is installed, else a tree."""
+    embree = embree_tracer(triangles) if triangles.device.type == "cpu" else None
+    return embree or tree_tracer(build_tree(triangles))
+
+
+def face_normals(triangles: Float[Tensor, "F 3 3"]) -> Float[Tensor, "F 3"]:
+    """Unit normals of triangles, on the side from which their corners run counter-clockwise."""
+    across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return safe_normalize(across, eps=TINY)
+
+
+def normals_towards_viewer(
+    smooth: Float[Tensor, "N 3"], flat: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """Shading normals at hits of rays: the interpolated normal, or that of the triangle at grazing angles, at
+    which the interpolated normal can face away from the viewer.
+    """
+    faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0
+    return torch.where(faces_viewer, smooth, flat)
+
+
 @dataclass(frozen=True)
-class Meeting:
-    """Where rays hit their triangles: the distance along the ray, and barycentric weights of the corners."""
+class PlaneHits:
+    """Intersections of rays with the planes of triangles: distance along the ray, and barycentric weights of
+    the corners, which are negative outside of the triangle.
+    """
 
     distance: Float[Tensor, " N"]
     weights: Float[Tensor, "N 3"]
 
 
-def meet(
+def intersect_planes(
     origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"], triangles: Float[Tensor, "N 3 3"]
-) -> Meeting:
+) -> PlaneHits:
     """Intersect each ray with the plane of its triangle (Möller & Trumbore 1997).
 
     The result is not finite for a ray parallel to the plane.
@@ -56,7 +96,7 @@ def meet(
     u = (offset * across).sum(-1) / determinant
     turned = torch.linalg.cross(offset, first)
     v = (directions * turned).sum(-1) / determinant
-    return Meeting((second * turned).sum(-1) / determinant, torch.stack([1.0 - u - v, u, v], dim=-1))
+    return PlaneHits((second * turned).sum(-1) / determinant, torch.stack([1.0 - u - v, u, v], dim=-1))
 
 
 # -------------------------------------------------------------------------------------------- a tree of boxes
@@ -99,7 +139,7 @@ def build_tree(triangles: Float[Tensor, "F 3 3"]) -> BoxTree:
 
 
 def tree_tracer(tree: BoxTree) -> FirstHits:
-    """Deterministic first hits by a tree, on its device."""
+    """Make a deterministic tracer that uses a tree, on its device."""
 
     def first_hits(origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Int[Tensor, " N"]:
         parts = zip(origins.split(RAYS_AT_ONCE), directions.split(RAYS_AT_ONCE), strict=True)
@@ -124,9 +164,9 @@ def _descend(
         kept = torch.nonzero(met)[:, 0]
         rays = rays[kept].repeat_interleave(BRANCHES)
         nodes = (BRANCHES * nodes[kept][:, None] + children).reshape(-1)
-    meeting = meet(origins[rays], directions[rays], tree.triangles[nodes])
-    inside = (meeting.weights >= -SLACK).all(-1) & (meeting.distance > 0.0)
-    distance = torch.where(inside, meeting.distance, torch.inf)
+    hits = intersect_planes(origins[rays], directions[rays], tree.triangles[nodes])
+    inside = (hits.weights >= -SLACK).all(-1) & (hits.distance > 0.0)
+    distance = torch.where(inside, hits.distance, torch.inf)
     nearest = distance.new_full((count,), torch.inf).scatter_reduce(0, rays, distance, "amin")
     # Of several triangles at the same distance take the one with the largest index, in every run.
     winner = torch.where(inside & (distance == nearest[rays]), tree.numbers[nodes], -1)
@@ -167,7 +207,7 @@ def _morton(points: Float[Tensor, "F 3"]) -> Int[Tensor, " F"]:
 
 
 def embree_tracer(triangles: Float[Tensor, "F 3 3"]) -> FirstHits | None:
-    """First hits by Embree, for rays on a CPU; None if Embree is not installed."""
+    """Make a tracer that uses Embree, for rays on a CPU; None if Embree is not installed."""
     try:
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError:

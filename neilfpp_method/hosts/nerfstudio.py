@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from neilfpp_method import losses
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import no_hits
 from neilfpp_method.hosts.base import RegularizedHits
+from neilfpp_method.hosts.conversion import no_hits
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, PixelBatch, RayBatch, SurfaceHits
@@ -77,7 +77,7 @@ class NerfstudioHost(nn.Module):
         self.frame = frame
         self.own_losses = own_losses
         # Recorded now: stages change requires_grad later, but some parameters are never trained.
-        self._moving = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
+        self._trained = [p for group in model.get_param_groups().values() for p in group if p.requires_grad]
 
     # -------------------------------------------------------------------------------------- the host contract
 
@@ -112,7 +112,7 @@ class NerfstudioHost(nn.Module):
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """All parameters that the model trains, as `geometry`: its fields hold shape and colour together."""
-        return {"geometry": self._moving}
+        return {"geometry": self._trained}
 
     # ---------------------------------------------------------------------------------------------- the model
 

@@ -11,8 +11,12 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.structures import OrientedPoints, RayBatch
 
-__all__ = ["OtherViewpoints", "other_viewpoints"]
+__all__ = ["CLOSE", "SAME_POINT", "OtherViewpoints", "other_viewpoints"]
 
+SAME_POINT = 0.01
+"""Largest distance between the hits of one point from two viewpoints, scene units."""
+CLOSE = 0.05
+"""Distance from a point at which rays start in the search for a near plane, scene units."""
 TANGENT = 0.6
 """Tangent of the angle between the other viewpoint and the direction halfway between normal and viewer."""
 

@@ -42,19 +42,19 @@ class OutputCheck:
         self.normals_known = False
         self._warned_of_constant = False
 
-    def __call__(self, rays: RayBatch, hits: Any, color_moves: bool) -> None:
+    def __call__(self, rays: RayBatch, hits: Any, trains_color: bool) -> None:
         """Check the output of one call.
 
         Args:
             rays: the rays that were rendered.
             hits: what the host returned, `SurfaceHits` if the host is correct.
-            color_moves: whether the colour should carry a gradient to the host.
+            trains_color: whether the colour should carry a gradient to the host.
 
         Raises:
             UserError: an output is invalid; the message names host, output and remedy.
         """
         check_tensors(self.name, rays, {f.name: getattr(hits, f.name, None) for f in fields(SurfaceHits)})
-        if color_moves and not hits.color.requires_grad:
+        if trains_color and not hits.color.requires_grad:
             self._constant_color()
         if not self.normals_known:
             self.normals_known = check_normals(self.name, hits, self.hit_share)

@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from neilfpp_method.hosts.answers import no_hits
+from neilfpp_method.hosts.conversion import no_hits
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Indexable, RayBatch, SceneLight, SurfaceHits
@@ -31,19 +31,19 @@ __all__ = ["ProxyReport", "SurfaceProxy"]
 
 POINTS = 32_768
 """Number of points kept: about four per cell on a surface of ten square units in a grid of 96³."""
-EVERY = 64
+REFRESH_INTERVAL = 64
 """Steps between two refreshes. The first refreshes are at steps 1, 2, 4, 8, …"""
-ROUNDS, ROUND = 16, 512
+EXPLORING_BATCHES, EXPLORING_RAYS = 16, 512
 """Number of batches, and rays per batch, with which `explore` explores the surface."""
-SPREAD = 0.2
+EXPLORING_RADIUS = 0.2
 """Largest offset of the targets of `explore` from known hits, per axis, scene units."""
-START = 0.75
+START_HEIGHT = 0.75
 """Height above the grid's surface at which rays start, in cells; tracing ends at a quarter cell."""
-APART = 2.0
+MAX_OVERSHOOT = 2.0
 """A ray that goes this much further than the grid's surface, in cells, shows that points are outdated."""
-CLEAR = 0.01
+MAX_MISS_OPACITY = 0.01
 """Largest opacity of a ray that counts as a miss."""
-GRAZING = 0.2
+MIN_COSINE = 0.2
 """Lower bound on the cosine between ray and normal in the final Newton step onto the surface."""
 
 log = logging.getLogger(__name__)
@@ -174,7 +174,9 @@ class SurfaceProxy(nn.Module):
         """Add the camera rays and hits of a training step, and refresh the grid when it is due."""
         self.steps += 1
         self._pending.append(RenderedRays(rays, hits.detach()))
-        if self.steps % EVERY == 0 or (self.steps < EVERY and self.steps & (self.steps - 1) == 0):
+        if self.steps % REFRESH_INTERVAL == 0 or (
+            self.steps < REFRESH_INTERVAL and self.steps & (self.steps - 1) == 0
+        ):
             self.refresh()
 
     @torch.no_grad()
@@ -188,10 +190,10 @@ class SurfaceProxy(nn.Module):
             rays, hits: the first batch and its hits.
         """
         hit_points = hits.position[hits.is_hit(self.hit_share)].detach()
-        for _ in range(ROUNDS if len(hit_points) else 0):
-            origins = rays.origins[torch.randint(len(rays), (ROUND,), device=hit_points.device)]
-            targets = hit_points[torch.randint(len(hit_points), (ROUND,), device=hit_points.device)]
-            targets = targets + SPREAD * (2 * torch.rand_like(targets) - 1)
+        for _ in range(EXPLORING_BATCHES if len(hit_points) else 0):
+            origins = rays.origins[torch.randint(len(rays), (EXPLORING_RAYS,), device=hit_points.device)]
+            targets = hit_points[torch.randint(len(hit_points), (EXPLORING_RAYS,), device=hit_points.device)]
+            targets = targets + EXPLORING_RADIUS * (2 * torch.rand_like(targets) - 1)
             new_rays = RayBatch(origins, safe_normalize(targets - origins))
             new_hits = render(new_rays).detach()
             self._pending.append(RenderedRays(new_rays, new_hits))
@@ -211,7 +213,7 @@ class SurfaceProxy(nn.Module):
         points = torch.cat((hits.position, hits.normal, hits.color), -1)
         hit &= points.isfinite().all(-1)
         if self._known_surface() is not None:
-            rows = torch.nonzero(hit | (hits.opacity < CLEAR))[:, 0]
+            rows = torch.nonzero(hit | (hits.opacity < MAX_MISS_OPACITY))[:, 0]
             observed = ObservedRays(rays[rows], distance[rows])
             traced = self._trace(observed.rays)
             self._report = self._compare(observed, traced)
@@ -249,7 +251,7 @@ class SurfaceProxy(nn.Module):
 
     def _remove_crossed_points(self, observed: ObservedRays, traced: GridHits) -> None:
         """Remove the points that rays of the host pass through."""
-        through = traced.hit & (observed.distance > traced.distance + APART * self.cell)
+        through = traced.hit & (observed.distance > traced.distance + MAX_OVERSHOOT * self.cell)
         crossed = observed.rays.origins + traced.distance[:, None] * observed.rays.directions
         stale = torch.zeros(self.resolution**3, dtype=torch.bool, device=crossed.device)
         stale[self._cells(crossed[through])] = True
@@ -280,7 +282,7 @@ class SurfaceProxy(nn.Module):
             return SceneLight(zeros > 0, torch.zeros_like(wi), torch.full_like(zeros, torch.inf))
         normal = grid_normal(surface.distance, self.radius, x)
         height = look_up(surface.distance, self.radius, x)
-        lift = (START * self.cell - height).clamp(0, (START + 1) * self.cell)
+        lift = (START_HEIGHT * self.cell - height).clamp(0, (START_HEIGHT + 1) * self.cell)
         start = (x + lift[:, None] * normal)[:, None].expand_as(wi).reshape(-1, 3)
         traced = self._trace(RayBatch(start, directions))
         rows = torch.nonzero(traced.hit)[:, 0]
@@ -340,7 +342,7 @@ class SurfaceProxy(nn.Module):
         directions = rays.directions[rows]
         end = start[rows] + traced.distance[rows, None] * directions
         cosine = -(grid_normal(grid, self.radius, end) * directions).sum(-1)
-        rest = (look_up(grid, self.radius, end) / cosine.clamp_min(GRAZING)).clamp(-self.cell, self.cell)
+        rest = (look_up(grid, self.radius, end) / cosine.clamp_min(MIN_COSINE)).clamp(-self.cell, self.cell)
         return GridHits((entry.distance + traced.distance).index_add(0, rows, rest), hit)
 
     def _entry(self, rays: RayBatch) -> CubeEntry:
@@ -363,10 +365,13 @@ class SurfaceProxy(nn.Module):
         self.steps, self._surface, self._report = state["steps"], None, None
         like = self.points.rows
         self._pending = [
-            RenderedRays(_made(RayBatch, tensors), _made(SurfaceHits, tensors)).map(lambda t: t.to(like))
+            RenderedRays(_from_named(RayBatch, tensors), _from_named(SurfaceHits, tensors)).map(
+                lambda t: t.to(like)
+            )
             for tensors in state["pending"]
         ]
 
 
-def _made(kind: type[RayBatch | SurfaceHits], tensors: Mapping[str, Tensor]) -> RayBatch | SurfaceHits:
+def _from_named(kind: type[RayBatch | SurfaceHits], tensors: Mapping[str, Tensor]) -> RayBatch | SurfaceHits:
+    """Build rays or hits from tensors by name; other tensors are ignored."""
     return kind(**{f.name: tensors[f.name] for f in fields(kind)})

@@ -25,10 +25,10 @@ RINGS = ((6, 1 / 3), (10, 2 / 3), (16, 1.0))
 """Number of neighbours on each ring around the point, and the ring's radius relative to the outermost."""
 NEIGHBORS = sum(count for count, _ in RINGS)
 """Number of points at which normals are evaluated, per shaded point."""
-UNLIKE = 0.2
+RESIDUAL_SCALE = 0.2
 """Residual of a unit normal at which its weight is 1/√e; it corresponds to 11.5°."""
-ROUNDS = 4
-"""Rounds of iteratively reweighted least squares."""
+ITERATIONS = 4
+"""Number of fits of iteratively reweighted least squares."""
 RIDGE = 1e-2
 """Ridge penalty, relative to the weight of one neighbour, for slopes that no neighbour determines."""
 
@@ -56,8 +56,8 @@ def smooth_normals(
     design = functional.pad(torch.cat((torch.zeros_like(ring[:1]), ring)), (1, 0), value=1.0)
     ridge = RIDGE * torch.eye(3).to(ring)
     residual = normals - normal[:, None]
-    for _ in range(ROUNDS):
-        weighted = design * torch.exp(-residual.square().sum(-1, keepdim=True) / (2 * UNLIKE**2))
+    for _ in range(ITERATIONS):
+        weighted = design * torch.exp(-residual.square().sum(-1, keepdim=True) / (2 * RESIDUAL_SCALE**2))
         # The ridge makes the matrix regular. `solve` would synchronise with the device to check that.
         coefficients = torch.linalg.solve_ex(weighted.mT @ design + ridge, weighted.mT @ normals).result
         residual = normals - design @ coefficients

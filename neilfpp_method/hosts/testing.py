@@ -78,7 +78,7 @@ def check_host(
     try:
         hits = render_checked(host, rays)
         stages = host.stages if isinstance(host, HasStages) else STAGES
-        trains_geometry = any("geometry" in plan.moves for plan in stages.values())
+        trains_geometry = any("geometry" in plan.trains for plan in stages.values())
         hit = hits.is_hit(HIT_SHARE).detach()
         now = partial(Modes.of, modules, parameters)
         case = Case(host, name, before, now, rays, parameters, trains_geometry, hits, hit)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.answers import as_hits
 from neilfpp_method.hosts.base import HasSurfaceWidth, Host
+from neilfpp_method.hosts.conversion import as_hits
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["HIT_SHARE", "Case", "ContractBroken", "Modes", "render_checked"]
@@ -30,7 +30,7 @@ class Modes:
     """Train/eval mode of a host's modules, and `requires_grad` of its parameters."""
 
     training: tuple[bool, ...]
-    moves: tuple[bool, ...]
+    requires_grad: tuple[bool, ...]
 
     @staticmethod
     def of(modules: Sequence[nn.Module], parameters: Sequence[nn.Parameter]) -> Modes:
@@ -44,8 +44,8 @@ class Modes:
             (p for module in modules for p in module.modules()), self.training, strict=True
         ):
             part.training = training
-        for parameter, moves in zip(parameters, self.moves, strict=True):
-            parameter.requires_grad_(moves)
+        for parameter, requires_grad in zip(parameters, self.requires_grad, strict=True):
+            parameter.requires_grad_(requires_grad)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def _one_camera(case: Case) -> None:
         case.require(False, f"cannot render rays that share their origin in memory ({error})")
 
 
-def _alone_as_together(case: Case) -> None:
+def _independent_of_batch(case: Case) -> None:
     whole, other = case.constants(case.rays), case.constants(case.rays, seed=1)
     for rows in (slice(0, None, 3), torch.arange(len(case.rays), device=case.hit.device).flip(0)):
         part = case.constants(case.rays[rows])
@@ -81,7 +81,7 @@ def _same_without_gradient(case: Case) -> None:
         case.require(same, f"its {name} differs under torch.no_grad")
 
 
-def _keeps_what_it_gave(case: Case) -> None:
+def _returns_copies(case: Case) -> None:
     first = case.constants(case.rays)
     copies = [getattr(first, field.name).clone() for field in fields(SurfaceHits)]
     case.constants(RayBatch(case.rays.origins, case.rays.directions.roll(1, dims=0)))
@@ -90,12 +90,13 @@ def _keeps_what_it_gave(case: Case) -> None:
         case.require(same, f"its {field.name} changes when it renders again: return a copy, not a buffer")
 
 
-def _leaves_modes_alone(case: Case) -> None:
+def _preserves_modes(case: Case) -> None:
     now = case.now()
     case.require(
         now.training == case.before.training, "rendering calls train() or eval(): leave the mode unchanged"
     )
-    case.require(now.moves == case.before.moves, "rendering changes requires_grad of its parameters")
+    unchanged = now.requires_grad == case.before.requires_grad
+    case.require(unchanged, "rendering changes requires_grad of its parameters")
     grad, dtype = torch.is_grad_enabled(), torch.get_default_dtype()
     case.host.render(case.rays)
     left = torch.is_grad_enabled() == grad and torch.get_default_dtype() == dtype
@@ -104,7 +105,7 @@ def _leaves_modes_alone(case: Case) -> None:
     case.require(left, "rendering leaves torch's gradient mode or default type changed: use a context")
 
 
-def _leaves_randomness_alone(case: Case) -> None:
+def _preserves_random_state(case: Case) -> None:
     case.require(
         not torch.equal(_next_draw(case, 1), _next_draw(case, 2)),
         "calls torch.manual_seed: leave seeding to the caller",
@@ -118,7 +119,7 @@ def _next_draw(case: Case, seed: int) -> Tensor:
         return torch.rand(4)
 
 
-BASIC_CHECKS = (_leaves_modes_alone, _one_ray, _one_camera, _repeatable)
+BASIC_CHECKS = (_preserves_modes, _one_ray, _one_camera, _repeatable)
 """Checks of what the checks of the geometry rely on: any rays can be rendered, repeatedly."""
-CONDUCT_CHECKS = (_alone_as_together, _same_without_gradient, _keeps_what_it_gave, _leaves_randomness_alone)
+CONDUCT_CHECKS = (_independent_of_batch, _same_without_gradient, _returns_copies, _preserves_random_state)
 """All other checks of the behaviour."""

@@ -9,34 +9,28 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from neilfpp_method.hosts.other_viewpoints import OtherViewpoints, other_viewpoints
+from neilfpp_method.hosts.other_viewpoints import CLOSE, SAME_POINT, OtherViewpoints, other_viewpoints
 from neilfpp_method.hosts.testing_case import HIT_SHARE, Case
 from neilfpp_method.structures import OrientedPoints, RayBatch
 
 __all__ = ["GEOMETRY_CHECKS"]
 
-APART = 0.01
-"""Largest permitted distance between the hits of one point in two views, in scene units. Twice the width of
-the soft layer is added to it.
-"""
-AGREE = 0.6
+MIN_AGREEMENT = 0.6
 """Smallest share of points that agree in both views. The others may be occluded or on a silhouette."""
-NEAR = 0.05
-"""Distance from which rays between surfaces may see a point, scene units."""
-BESIDE = 0.01
+RAY_SPACING = 0.01
 """Distance between neighbouring rays, scene units."""
-STEEP = 8.0
-"""Neighboring hits that are further apart than this multiple of their rays' distance lie on two surfaces."""
-TILTED = 10.0
+MAX_SLOPE = 8.0
+"""Neighbouring hits that are further apart than this multiple of their rays' distance lie on two surfaces."""
+MAX_ANGLE = 10.0
 """Largest median angle between normals and the surface through neighbouring hits, degrees."""
-SPHERE = 1.5
+MAX_MEDIAN_DISTANCE = 1.5
 """Largest median distance of hits from the origin, scene units; the object may stand on a ground."""
 
 
-def _in_the_sphere(case: Case) -> None:
+def _in_unit_sphere(case: Case) -> None:
     reach = case.hits.position.detach()[case.hit].norm(dim=-1).median().item()
     broken = f"half of its hits are {reach:.3g} or more from the origin: scale the scene into the unit sphere"
-    case.require(reach < SPHERE, broken)
+    case.require(reach < MAX_MEDIAN_DISTANCE, broken)
 
 
 def _another_view(case: Case) -> None:
@@ -54,9 +48,9 @@ def _from_afar(case: Case) -> None:
 
 def _from_close_by(case: Case) -> None:
     others = _other_viewpoints(case)
-    rays = others.rays(torch.full_like(others.distance, NEAR))
+    rays = others.rays(torch.full_like(others.distance, CLOSE))
     suspect = "light between surfaces would not see it (a near plane?)"
-    _require_same_hits(case, others.position, rays, f"{NEAR} away", suspect)
+    _require_same_hits(case, others.position, rays, f"{CLOSE} away", suspect)
 
 
 def _normals_of_neighbors(case: Case) -> None:
@@ -66,11 +60,13 @@ def _normals_of_neighbors(case: Case) -> None:
     up = torch.linalg.cross(d, side)
     origins = case.rays.origins[case.hit]
     neighbors = [
-        case.constants(RayBatch(origins + sign * BESIDE * axis, d)) for axis in (side, up) for sign in (1, -1)
+        case.constants(RayBatch(origins + sign * RAY_SPACING * axis, d))
+        for axis in (side, up)
+        for sign in (1, -1)
     ]
     across, along = (a.position - b.position for a, b in (neighbors[:2], neighbors[2:]))
     hit_by_all = torch.stack([f.is_hit(HIT_SHARE) for f in neighbors]).all(0)
-    near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * STEEP * BESIDE
+    near = torch.stack([across.norm(dim=-1), along.norm(dim=-1)]).amax(0) < 2 * MAX_SLOPE * RAY_SPACING
     rows = hit_by_all & near
     if rows.sum() < 8:
         # The surface is too small or too rough for a decision.
@@ -79,7 +75,7 @@ def _normals_of_neighbors(case: Case) -> None:
     normal = case.hits.normal.detach()[case.hit][rows]
     angle = (implied * normal).sum(-1).abs().clamp_max(1.0).acos().rad2deg().median().item()
     broken = f"half of its normals differ by {angle:.0f}° or more from the surface through neighbouring hits"
-    case.require(angle < TILTED, f"{broken}: take the gradient of the field that is rendered")
+    case.require(angle < MAX_ANGLE, f"{broken}: take the gradient of the field that is rendered")
 
 
 def _other_viewpoints(case: Case) -> OtherViewpoints:
@@ -90,6 +86,8 @@ def _other_viewpoints(case: Case) -> OtherViewpoints:
 def _require_same_hits(case: Case, position: Tensor, rays: RayBatch, viewpoint: str, suspect: str) -> None:
     """Require that most rays hit the positions to which they lead.
 
+    Twice the width of a soft surface is added to the distance that counts as the same point.
+
     Args:
         case: the host under test.
         position: surface points that are known from the first view.
@@ -98,10 +96,11 @@ def _require_same_hits(case: Case, position: Tensor, rays: RayBatch, viewpoint: 
         suspect: the end of the message: the probable cause, or the consequence.
     """
     again = case.constants(rays)
-    apart = (again.position - position).norm(dim=-1)
-    same = (again.is_hit(HIT_SHARE) & (apart <= APART + 2 * case.width)).float().mean().item()
+    offset = (again.position - position).norm(dim=-1)
+    largest = SAME_POINT + 2 * case.width
+    same = (again.is_hit(HIT_SHARE) & (offset <= largest)).float().mean().item()
     lost = f"{1 - same:.0%} of its hits have another position when seen from {viewpoint}"
-    case.require(same >= AGREE, f"{lost}: {suspect}")
+    case.require(same >= MIN_AGREEMENT, f"{lost}: {suspect}")
 
 
-GEOMETRY_CHECKS = (_in_the_sphere, _another_view, _from_afar, _from_close_by, _normals_of_neighbors)
+GEOMETRY_CHECKS = (_in_unit_sphere, _another_view, _from_afar, _from_close_by, _normals_of_neighbors)

@@ -62,7 +62,7 @@ class RegularizerInputs:
 
     gradient: Float[Tensor, "A 3"]
     distance: Float[Tensor, " B"]
-    curved: Float[Tensor, "C 3"]
+    hessian_points: Float[Tensor, "C 3"]
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class VolSdfHost(nn.Module):
     # -------------------------------------------------------------------------------------- the host contract
 
     def render(self, rays: RayBatch) -> SurfaceHits:
-        """Color, position and normal of each ray, blended with the rendering weights (METHOD §3).
+        """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
 
         With `volume.skip_empty`, evaluation without gradients samples only the parts of rays that may be
         visible, according to a grid of the current field.
@@ -362,7 +362,7 @@ class VolSdfHost(nn.Module):
         if "surface" in names:
             terms["surface"] = losses.surface(inputs.distance, SURFACE_WIDTH[self.config.loss.points])
         if "hessian" in names:
-            terms["hessian"] = losses.hessian(self.sdf_field.hessian(inputs.curved))
+            terms["hessian"] = losses.hessian(self.sdf_field.hessian(inputs.hessian_points))
         if "point_cloud" in names and (points := self.points) is not None:
             count = len(points.position)
             drawn = points[torch.randint(count, (len(batch),), device=points.position.device)]

@@ -229,27 +229,27 @@ def point_gradient(
 
 
 @compiled
-def sphere_trace(grid, radius, origins, directions, least, most_steps, distance, hit, start, stop):
+def sphere_trace(grid, radius, origins, directions, hit_distance, max_steps, distance, hit, start, stop):
     """Trace the rays in [start, stop) in a grid of distances.
 
-    Writes the length of each ray, and whether it came closer to a surface than `least`.
+    Writes the length of each ray, and whether it came closer to a surface than `hit_distance`.
     """
     number = grid.dtype.type
     cells = len(grid) - 1
     edge, reach = number(2 * radius / cells), number(radius)
     for n in range(start, stop):
         length, is_hit = number(0), False
-        for _ in range(most_steps):
+        for _ in range(max_steps):
             x = origins[n, 0] + length * directions[n, 0]
             y = origins[n, 1] + length * directions[n, 1]
             z = origins[n, 2] + length * directions[n, 2]
             if abs(x) > reach or abs(y) > reach or abs(z) > reach:
                 break
             clearance = _at_vertices(grid, (x + reach) / edge, (y + reach) / edge, (z + reach) / edge, cells)
-            if clearance < least:
+            if clearance < hit_distance:
                 is_hit = True
                 break
-            length += max(clearance, least)
+            length += max(clearance, hit_distance)
         distance[n], hit[n] = length, is_hit
 
 

@@ -34,7 +34,7 @@ __all__ = [
 PIXELS = "neilfpp_pixels"
 """Key of a dataset's metadata under which the model finds the `PixelDataset`."""
 
-FACTS = {"object_mask": "mask", "mask_known": "mask_known", "image_gradient": "image_gradient"}
+LOSS_INPUTS = {"object_mask": "mask", "mask_known": "mask_known", "image_gradient": "image_gradient"}
 """Keys of a nerfstudio batch and the attributes of `PixelBatch` that they hold. The mask is not called `mask`
 because nerfstudio would then draw no pixels outside of it, which L_vol needs.
 """
@@ -53,7 +53,7 @@ class CaptureDataset(InputDataset):
 
     exclude_batch_keys_from_device: ClassVar = [
         *InputDataset.exclude_batch_keys_from_device,
-        *FACTS,
+        *LOSS_INPUTS,
         VALID,
         NEAR,
     ]
@@ -79,8 +79,8 @@ class CaptureDataset(InputDataset):
         """Loss inputs of each pixel, and which pixels can be drawn, (H, W, 1) each."""
         i = data["image_idx"]
         pixels = self.pixels.view(i)
-        facts = {key: self._image(i, getattr(pixels, name)) for key, name in FACTS.items()}
-        return facts | {
+        inputs = {key: self._image(i, getattr(pixels, name)) for key, name in LOSS_INPUTS.items()}
+        return inputs | {
             VALID: self._image(i, self.pixels.valid(i)),
             NEAR: self._image(i, self.pixels.near(i)),
         }
@@ -98,9 +98,9 @@ def to_pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -
         directions: (N, 3), unit.
         batch: values of the N pixels, as drawn by `CapturePixelSampler` from a `CaptureDataset`.
     """
-    facts = {name: batch[key].to(origins.device)[:, 0] for key, name in FACTS.items()}
+    inputs = {name: batch[key].to(origins.device)[:, 0] for key, name in LOSS_INPUTS.items()}
     color, view = batch["image"].to(origins.device), batch["indices"][:, 0].to(origins.device)
-    return PixelBatch(origins=origins, directions=directions, color=color, view=view, **facts)
+    return PixelBatch(origins=origins, directions=directions, color=color, view=view, **inputs)
 
 
 class CapturePixelSampler(PixelSampler):

@@ -82,13 +82,13 @@ def _cameras(cameras: Sequence[Camera]) -> Cameras:
     poses = np.stack([camera.c2w * FLIP for camera in cameras])
     intrinsics = {name: column(name).float() for name in ("fx", "fy", "cx", "cy")}
     sizes = {name: column(name) for name in ("width", "height")}
-    bent = any(camera.lens is not None for camera in cameras)
+    is_distorted = any(camera.lens is not None for camera in cameras)
     kinds = [CameraType.FISHEYE if _is_fisheye(camera) else CameraType.PERSPECTIVE for camera in cameras]
     return Cameras(
         torch.from_numpy(poses).float(),
         **intrinsics,
         **sizes,
-        distortion_params=torch.tensor([_distortion(camera) for camera in cameras]) if bent else None,
+        distortion_params=torch.tensor([_distortion(camera) for camera in cameras]) if is_distorted else None,
         camera_type=torch.tensor([[kind.value] for kind in kinds]),
     )
 

@@ -34,7 +34,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, to_pixel_batch
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.plugin.outputs import method_outputs
-from neilfpp_method.plugin.pictures import view_figures, view_pictures
+from neilfpp_method.plugin.pictures import material_pictures, view_figures, view_pictures
 from neilfpp_method.plugin.record import RunRecord, no_record
 from neilfpp_method.schedule import Stage, active_losses, has_material, stage_at, total_steps, weigh
 from neilfpp_method.settings.facts import SceneFacts
@@ -154,7 +154,7 @@ class NeilfMethod(Model):
         self.proxy = proxy_for(host, settings)
         foreign_host = ForeignHost(host, borrowed=False, proxy=self.proxy)
         self.neilf = NeilfModel(foreign_host, settings, facts)
-        self.neilf.observers.append(lambda batch, hits: foreign_host.show_proxy(batch.rays, hits))
+        self.neilf.observers.append(lambda batch, hits: foreign_host.update_proxy(batch.rays, hits))
         if self.proxy is not None:
             CONSOLE.log(
                 f"{name} cannot trace rays cheaply: shadows and inter-reflection are traced on a proxy of "
@@ -223,7 +223,7 @@ class NeilfMethod(Model):
             # `neilfpp train` computes with flushed denormal numbers: ten times as fast, and other roundings.
             self.while_training.enter_context(computing_fast())
         if self.set_up_for is not position.stage:
-            if self.neilf.stages[position.stage].moves_material and self.light_solver.seeks_start:
+            if self.neilf.stages[position.stage].trains_material and self.light_solver.seeks_start:
                 self._start_light(step)
             self.neilf.freeze_for(position.stage)
             self.set_up_for = position.stage
@@ -334,7 +334,8 @@ class NeilfMethod(Model):
         if self.training:
             return {"origins": rays.origins, "directions": rays.directions}
         # Before material is trained, its initial values are not shown.
-        return method_outputs(self.neilf, rays, with_material=self._has_material())
+        maps = self.neilf.maps(rays) if self._has_material() else self.neilf.host_maps(rays)
+        return method_outputs(self.neilf, rays, maps)
 
     def _has_material(self) -> bool:
         return has_material(self.step + 1, self.config.neilf.train)
@@ -345,5 +346,7 @@ class NeilfMethod(Model):
         """Figures of a view, as in `neilfpp eval`, and pictures of its maps, for nerfstudio's log."""
         batch = {key: value.to(self.device) for key, value in batch.items() if isinstance(value, Tensor)}
         response = self.neilf.facts.response
-        pictures = view_pictures(outputs, batch, response, self._has_material())
+        pictures = view_pictures(outputs, batch, response)
+        if self._has_material():
+            pictures |= material_pictures(outputs)
         return view_figures(outputs, batch, response), pictures

@@ -14,15 +14,15 @@ from neilfpp_method.structures import Maps, RayBatch
 __all__ = ["mean_incident_light", "method_outputs"]
 
 
-def method_outputs(neilf: NeilfModel, rays: RayBatch, with_material: bool) -> dict[str, Tensor]:
-    """Render all maps of rays; `rgb` and `rgb_volume` are in the response of the capture.
+def method_outputs(neilf: NeilfModel, rays: RayBatch, maps: Maps) -> dict[str, Tensor]:
+    """Name the maps of rays as nerfstudio does; `rgb` and `rgb_volume` are in the response of the capture.
 
     Args:
         neilf: the method, in evaluation mode.
         rays: rays in the scene frame.
-        with_material: whether material has been trained; if not, its maps are 0.
+        maps: what the method rendered for them.
     """
-    maps, response = neilf.maps(rays, with_material), neilf.facts.response
+    response = neilf.facts.response
     return {
         "rgb": apply_response(maps.rgb, response),
         "rgb_volume": apply_response(maps.rgb_volume, response),

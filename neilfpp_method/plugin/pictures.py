@@ -14,7 +14,7 @@ from neilfpp_method.evaluate.metrics import psnr, ssim
 from neilfpp_method.plugin.datamanager import VALID
 from neilfpp_method.shading.color import display_values, tone_map
 
-__all__ = ["view_figures", "view_pictures"]
+__all__ = ["material_pictures", "view_figures", "view_pictures"]
 
 
 def view_figures(
@@ -40,29 +40,30 @@ def view_figures(
 
 
 def view_pictures(
-    outputs: Mapping[str, Tensor], batch: Mapping[str, Tensor], response: str, with_material: bool
+    outputs: Mapping[str, Tensor], batch: Mapping[str, Tensor], response: str
 ) -> dict[str, Float[Tensor, "H _ 3"]]:
-    """Display values of the maps of a view by name; `img` shows the photograph beside the PBR image.
+    """Display values of images and geometry by name; `img` shows the photograph beside the PBR image.
 
     Args:
         outputs: outputs of `NeilfMethod` for the view, (H, W, C) each.
         batch: image and loss inputs of the view (`CaptureDataset`), (H, W, C) each, on the same device.
         response: what the image and the colours of the outputs hold: "linear" or "srgb".
-        with_material: whether material has been trained; if not, its maps are left out.
     """
     accumulation = outputs["accumulation"]
     sides = [display_values(image, response) for image in (batch["image"], outputs["rgb"])]
-    pictures = {
+    return {
         "img": torch.cat(sides, dim=1),
         "rgb_volume": display_values(outputs["rgb_volume"], response),
         "normal": 0.5 * (outputs["normal"] + 1.0) * accumulation,
         "depth": colormaps.apply_depth_colormap(outputs["depth"], accumulation),
         "accumulation": accumulation.expand(-1, -1, 3),
     }
-    if with_material:
-        pictures |= {name: tone_map(outputs[name]) for name in ("base_color", "incident_light")}
-        pictures |= {name: outputs[name].expand(-1, -1, 3) for name in ("roughness", "metallic")}
-    return pictures
+
+
+def material_pictures(outputs: Mapping[str, Tensor]) -> dict[str, Float[Tensor, "H W 3"]]:
+    """Display values of material and light of a view by name, from outputs as for `view_pictures`."""
+    colors = {name: tone_map(outputs[name]) for name in ("base_color", "incident_light")}
+    return colors | {name: outputs[name].expand(-1, -1, 3) for name in ("roughness", "metallic")}
 
 
 def _counted(outputs: Mapping[str, Tensor], batch: Mapping[str, Tensor]) -> Bool[np.ndarray, "H W"]:

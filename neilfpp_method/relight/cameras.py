@@ -17,6 +17,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch
 
 __all__ = [
+    "MAX_SIDE",
     "MAX_WIDTH",
     "ImageRays",
     "Shot",

@@ -36,14 +36,14 @@ from neilfpp_method.relight.maps import map_names, read_map
 from neilfpp_method.relight.movie import write_movie
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.picture_folder import PictureFolder
-from neilfpp_method.relight.recovered import check_material, surface_of_run
+from neilfpp_method.relight.recovered import surface_of_run
 from neilfpp_method.relight.request import RelightRequest, check_request
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.train.checkpoint import checkpoint_path
 from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.output import check_folder
-from neilfpp_method.train.run import Run, load_run
+from neilfpp_method.train.run import Run, check_material, load_run
 
 __all__ = ["relight"]
 

@@ -152,11 +152,12 @@ def _reflectance(at: Vertices, lobe: Lobe | None) -> Float[Tensor, "N 3"]:
 def _from_sky(scene: Scene, at: Vertices, u: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
     """Reflected light of the map, from one direction sampled in proportion to the map."""
     sample = scene.sky.sample(u)
-    value, rows = _scattering(scene, at, sample.wi)
+    scattering = _scattering(scene, at, sample.wi)
+    rows = scattering.rows
     wi, pdf, at = sample.wi[rows], sample.pdf[rows], at[rows]
     unoccluded = ~scene.surface.blocked(at.position + OFFSET * at.flat, wi)
     weight = power_heuristic(pdf, scattering_pdf(at, wi, scene.lobe)) * unoccluded / pdf
-    light = value * scene.sky.lookup(wi) * weight[:, None]
+    light = scattering.value * scene.sky.lookup(wi) * weight[:, None]
     return torch.zeros_like(sample.wi).index_put((rows,), light)
 
 
@@ -166,9 +167,9 @@ def _from_lamps(
     """Reflected light of the lamps, from one direction towards one of them."""
     origins = at.position + OFFSET * at.flat
     sample = lamps.sample(origins, u)
-    value, rows = _scattering(scene, at, sample.wi)
-    valid = sample.pdf[rows] > 0
-    rows, value = rows[valid], value[valid]
+    scattering = _scattering(scene, at, sample.wi)
+    valid = sample.pdf[scattering.rows] > 0
+    rows, value = scattering.rows[valid], scattering.value[valid]
     wi, pdf, at = sample.wi[rows], sample.pdf[rows], at[rows]
     unoccluded = ~scene.surface.blocked(origins[rows], wi, sample.distance[rows])
     weight = power_heuristic(pdf, scattering_pdf(at, wi, scene.lobe)) * unoccluded / pdf
@@ -176,13 +177,20 @@ def _from_lamps(
     return torch.zeros_like(sample.wi).index_put((rows,), light)
 
 
-def _scattering(
-    scene: Scene, at: Vertices, wi: Float[Tensor, "N 3"]
-) -> tuple[Float[Tensor, "K 3"], Int[Tensor, " K"]]:
-    """f · cosine at the rows where it is not zero, and these rows; other rows need no shadow ray."""
+@dataclass(frozen=True)
+class _Scattering:
+    """The vertices that scatter light from sampled directions, and f · cosine there; the others need no
+    shadow ray.
+    """
+
+    rows: Int[Tensor, " K"]
+    value: Float[Tensor, "K 3"]
+
+
+def _scattering(scene: Scene, at: Vertices, wi: Float[Tensor, "N 3"]) -> _Scattering:
     value = brdf_cosine(at, wi, scene.lobe)
     rows = torch.nonzero(value.amax(-1) > 0)[:, 0]
-    return value[rows], rows
+    return _Scattering(rows, value[rows])
 
 
 # ---------------------------------------------------------------------------------------------- BRDF sampling

@@ -7,23 +7,13 @@ from collections.abc import Callable
 import torch
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
+from neilfpp_method.export.surface_cache import shaded_surface, shading_normals
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.relight.surface import Surface
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["check_material", "surface_of_run"]
-
-
-def check_material(run: Run) -> None:
-    """Check that the run has a material.
-
-    Raises:
-        UserError: no stage has estimated the material yet.
-    """
-    if not run.has_material:
-        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
 
 
 @torch.no_grad()
@@ -53,10 +43,9 @@ def surface_of_run(
             f"{run.path}: the host of this run has no surface to trace",
             "use a run of the VolSDF or mesh host",
         )
-    surface = extracted_surface(run, resolution, shaded=True, say=say, keep=keep)
-    assert surface.normals is not None
-    faces = surface.faces
+    surface = shaded_surface(run, resolution, say, keep)
     triangles, corner_normals = (
-        torch.from_numpy(values[faces]).to(run.device) for values in (surface.vertices, surface.normals)
+        torch.from_numpy(values[surface.faces]).to(run.device)
+        for values in (surface.vertices, surface.normals)
     )
     return Surface(triangles, corner_normals)

@@ -15,7 +15,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import image_header, read_image
 from neilfpp_method.data.views import Camera, pixel_index, project
 from neilfpp_method.errors import UserError
-from neilfpp_method.relight.cameras import resized
+from neilfpp_method.relight.cameras import MAX_SIDE, resized
 from neilfpp_method.relight.edits import Limit
 from neilfpp_method.relight.surface import Surface
 
@@ -53,8 +53,8 @@ def read_stencils(paths: Sequence[Path], capture: Capture) -> list[Stencil]:
     Edits apply at white pixels, but not at transparent ones.
 
     Raises:
-        UserError: there is no such file or view, the aspect ratio differs from the view's, or no pixel is
-            white.
+        UserError: there is no such file or view, the aspect ratio differs from the view's, a side has more
+            than 8192 pixels, or no pixel is white.
     """
     return [_read(path, capture) for path in paths]
 
@@ -81,6 +81,11 @@ def _read(path: Path, capture: Capture) -> Stencil:
             f"{path}: the mask has {header.width}×{header.height} pixels, but the view has "
             f"{camera.width}×{camera.height}",
             "paint it over the whole view, in any size with the same aspect ratio",
+        )
+    if max(header.width, header.height) > MAX_SIDE:
+        raise UserError(
+            f"{path}: the mask has {header.width}×{header.height} pixels",
+            f"reduce it to at most {MAX_SIDE} pixels per side",
         )
     camera = resized(capture.normalization.camera(camera), factor)
     file = read_image(path)

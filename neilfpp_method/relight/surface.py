@@ -8,7 +8,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import (
+    face_normals,
+    first_hits_of,
+    intersect_planes,
+    normals_towards_viewer,
+)
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Indexable
 
@@ -18,8 +23,6 @@ OFFSET = 1e-4
 """Height above a triangle at which rays start, scene units. It is larger than rounding errors (1e-6) and
 smaller than details of the surface.
 """
-TINY = 1e-18
-"""Length of the cross product of two edges below which a triangle has no normal."""
 
 
 @dataclass(frozen=True)
@@ -56,32 +59,29 @@ class Surface:
     def __init__(
         self, triangles: Float[Tensor, "F 3 3"], corner_normals: Float[Tensor, "F 3 3"] | None = None
     ) -> None:
-        across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         self.triangles = triangles
-        self.outward = safe_normalize(across, eps=TINY)
+        self.outward = face_normals(triangles)
         self.corner_normals = (
             self.outward[:, None].expand(-1, 3, -1) if corner_normals is None else corner_normals
         )
-        tracer = embree_tracer(triangles) if triangles.device.type == "cpu" else None
-        self._first_hits = tracer or tree_tracer(build_tree(triangles))
+        self._first_hits = first_hits_of(triangles)
 
     def intersect(self, origins: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> Intersections:
         """Find the first hits of rays with unit directions."""
         numbers = self._first_hits(origins, directions)
         rows = torch.nonzero(numbers >= 0)[:, 0]
         numbers, origins, directions = numbers[rows], origins[rows], directions[rows]
-        hit = meet(origins, directions, self.triangles[numbers])
+        hit = intersect_planes(origins, directions, self.triangles[numbers])
         flat = self.outward[numbers]
         # Barycentric weights are NaN if a ray lies in the plane of its triangle.
         weights = hit.weights.nan_to_num(1 / 3)[..., None]
         smooth = safe_normalize((weights * self.corner_normals[numbers]).sum(1))
-        faces_viewer = (smooth * directions).sum(-1, keepdim=True) < 0
         distance = hit.distance.nan_to_num(0.0, 0.0, 0.0)
         return Intersections(
             rows=rows,
             distance=distance,
             position=origins + distance[:, None] * directions,
-            normal=torch.where(faces_viewer, smooth, flat),
+            normal=normals_towards_viewer(smooth, flat, directions),
             flat=flat,
             outside=(flat * directions).sum(-1) < 0,
         )
@@ -98,5 +98,5 @@ class Surface:
         if before is None:
             return hit
         rows = torch.nonzero(hit)[:, 0]
-        distance = meet(origins[rows], directions[rows], self.triangles[numbers[rows]]).distance
+        distance = intersect_planes(origins[rows], directions[rows], self.triangles[numbers[rows]]).distance
         return hit.index_put((rows,), distance < before[rows])

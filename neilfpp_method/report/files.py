@@ -8,11 +8,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from jaxtyping import UInt8
+
+from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.health.cases import Finding
-from neilfpp_method.report.measured import OWN, Measured, numbers, read_measured
-from neilfpp_method.schedule import stage_steps
+from neilfpp_method.report.measured import OWN, Measured, finite_numbers, read_measured
+from neilfpp_method.schedule import Stage, total_steps
 from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light
 from neilfpp_method.settings.types import MeshConfig, NeilfConfig
@@ -22,13 +26,13 @@ from neilfpp_method.train.quality import QualityCheck, read_checks
 from neilfpp_method.train.run import read_description
 from neilfpp_method.train.work_record import read_work
 
-__all__ = ["Changed", "Files", "changed_settings", "flat_settings", "read_files"]
+__all__ = ["ChangedSetting", "RunFiles", "changed_settings", "flat_settings", "read_files"]
 
 Read = TypeVar("Read")
 
 
 @dataclass(frozen=True)
-class Changed:
+class ChangedSetting:
     """A setting that differs from the preset; `preset_value` is None if the preset has no such setting."""
 
     name: str
@@ -37,7 +41,7 @@ class Changed:
 
 
 @dataclass(frozen=True)
-class Files:
+class RunFiles:
     """The contents of a run's files.
 
     Attributes:
@@ -46,9 +50,10 @@ class Files:
         steps: number of steps of the whole training.
         findings: findings of the health checks; None if the run has no record of them.
         measured: figures by protocol, this project's own first; empty if the run was not evaluated.
-        timing: seconds by stage.
-        work: seconds by stage and kind of work.
+        timing: seconds by stage, without kinds of work.
+        work: seconds by stage and kind of work; empty for a run of an earlier version.
         checks: measurements at held-back pixels during training.
+        previews: image at the end of each stage, by the name of the stage.
         effects: one row per effect, from `effects.json`.
         machine: hardware and package versions, from `environment.json`.
         notes: one message per file that could not be read.
@@ -62,6 +67,7 @@ class Files:
     timing: Mapping[str, float]
     work: Mapping[str, Mapping[str, float]]
     checks: Sequence[QualityCheck]
+    previews: Mapping[str, UInt8[np.ndarray, "H W 3"]]
     effects: list[Mapping[str, Any]]
     machine: Mapping[str, Any]
     notes: list[str]
@@ -71,8 +77,19 @@ class Files:
         """Whether any file has a result: a finding, a figure or a time, not only settings and effects."""
         return any((self.findings, self.measured, self.timing, self.work, self.checks))
 
+    @property
+    def seconds(self) -> Mapping[str, float]:
+        """Seconds by stage; empty if no stage has been timed."""
+        return {stage: sum(parts.values()) for stage, parts in self.work.items()} or self.timing
 
-def read_files(path: Path) -> Files:
+    @property
+    def gpus(self) -> list[str]:
+        """Names of the GPUs of the machine; empty if there are none, or the machine is not known."""
+        gpus = self.machine.get("gpus")
+        return [str(gpu) for gpu in gpus] if isinstance(gpus, list) else []
+
+
+def read_files(path: Path) -> RunFiles:
     """Read the files of a run. A damaged file is skipped and noted, unless it holds the settings.
 
     Raises:
@@ -91,25 +108,38 @@ def read_files(path: Path) -> Files:
     def optional_json(name: str) -> dict[str, Any]:
         return read_or(lambda: read_json(path / name), {}) if (path / name).is_file() else {}
 
+    def seconds_of_stages() -> dict[str, float]:
+        file = path / "timing.json"
+        return finite_numbers(file, read_json(file)) if file.is_file() else {}
+
     protocols = (OWN, *PROTOCOLS)
     measured = {name: read_or(partial(read_measured, path, name), None) for name in protocols}
+    pictures = {stage.value: path / "previews" / f"{stage.value}.png" for stage in Stage}
+    previews = {
+        name: read_or(partial(_picture, file), None) for name, file in pictures.items() if file.is_file()
+    }
     rows = optional_json("effects.json").get("effects")
-    return Files(
+    return RunFiles(
         path=path,
         config=config,
-        steps=sum(stage_steps(config.train).values()),
+        steps=total_steps(config.train),
         findings=read_or(lambda: read_findings(path), None),
         measured={name: figures for name, figures in measured.items() if figures is not None},
-        timing=numbers(optional_json("timing.json")),
+        timing=read_or(seconds_of_stages, {}),
         work=read_or(lambda: read_work(path), {}),
         checks=read_or(lambda: read_checks(path), []),
+        previews={name: pixels for name, pixels in previews.items() if pixels is not None},
         effects=[row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else [],
         machine=optional_json("environment.json"),
         notes=notes,
     )
 
 
-def changed_settings(config: NeilfConfig) -> list[Changed] | None:
+def _picture(file: Path) -> UInt8[np.ndarray, "H W 3"]:
+    return (read_image(file).pixels * 255).round().astype(np.uint8)
+
+
+def changed_settings(config: NeilfConfig) -> list[ChangedSetting] | None:
     """List the settings that differ from the run's preset; None if this version does not know the preset."""
     name = config.preset.removesuffix("-mesh")
     if name in PRESETS:
@@ -122,7 +152,7 @@ def changed_settings(config: NeilfConfig) -> list[Changed] | None:
     base = free_light(base) if config.light.kind == "free" and base.light.kind != "free" else base
     own, preset = flat_settings(to_dict(config)), flat_settings(to_dict(base))
     return [
-        Changed(key, str(value), str(preset[key]) if key in preset else None)
+        ChangedSetting(key, str(value), str(preset[key]) if key in preset else None)
         for key, value in own.items()
         if key not in preset or preset[key] != value
     ]

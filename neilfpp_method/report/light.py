@@ -10,7 +10,7 @@ import numpy as np
 from neilfpp_method.evaluate.pictures import auto_exposure, display_color
 from neilfpp_method.export.light import lamps_in_world
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.report.encoded import encoded
+from neilfpp_method.report.data_urls import image_url
 from neilfpp_method.train.run import Run
 
 __all__ = ["MapPicture", "lamps_of", "picture_of_map"]
@@ -39,7 +39,7 @@ def picture_of_map(run: Run) -> MapPicture | None:
     exposure = auto_exposure(radiance.reshape(-1, 3))
     factor = max(1, -(-MIN_HEIGHT // len(radiance)))
     enlarged = np.kron(display_color(radiance, exposure), np.ones((factor, factor, 1), np.uint8))
-    return MapPicture(encoded(enlarged), exposure)
+    return MapPicture(image_url(enlarged), exposure)
 
 
 def lamps_of(run: Run) -> list[dict[str, Any]]:

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from neilfpp_method.errors import UserError
 from neilfpp_method.train.checkpoint import last_checkpoint
-from neilfpp_method.train.json_files import read_json
+from neilfpp_method.train.json_files import is_finite_number, read_json
 
-__all__ = ["OWN", "Measured", "is_outdated", "numbers", "read_measured"]
+__all__ = ["OWN", "Measured", "count_of_views", "finite_numbers", "is_outdated", "read_measured"]
 
 OWN = "neilfpp"
 """The name of this project's own protocol."""
@@ -41,8 +42,7 @@ class Measured:
         """Number of views and their size for display; empty if they are not known."""
         if self.views is None or self.size is None:
             return ""
-        views = f"{len(self.views)} views" if len(self.views) != 1 else "one view"
-        return f"{views} of {self.size[0]}×{self.size[1]} pixels"
+        return f"{count_of_views(len(self.views))} of {self.size[0]}×{self.size[1]} pixels"
 
 
 def read_measured(path: Path, protocol: str) -> Measured | None:
@@ -56,7 +56,7 @@ def read_measured(path: Path, protocol: str) -> Measured | None:
         The figures; None if the run was not measured by this protocol.
 
     Raises:
-        UserError: if the file is damaged.
+        UserError: the file is damaged, or a figure is not finite.
     """
     file = path / "metrics.json" if protocol == OWN else path / "eval" / f"{protocol}.json"
     if not file.is_file():
@@ -71,11 +71,26 @@ def is_outdated(file: Path, run: Path) -> bool:
     return checkpoint.is_file() and file.stat().st_mtime < checkpoint.stat().st_mtime
 
 
-def numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """Keep the values that are numbers; booleans are dropped."""
-    return {
-        key: float(v) for key, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)
-    }
+def finite_numbers(file: Path, values: Mapping[str, Any]) -> dict[str, float]:
+    """Keep the values of a file that are numbers; booleans, texts and lists are left out.
+
+    Raises:
+        UserError: a number is NaN, infinite, or too large for a float.
+    """
+    numbers = {k: v for k, v in values.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+    for key, value in numbers.items():
+        if not is_finite_number(value):
+            raise UserError(f"{file}: {key} is not a finite number", "restore the file, or remove it")
+    return {key: float(value) for key, value in numbers.items()}
+
+
+def count_of_views(count: int) -> str:
+    """A number of views in words.
+
+    >>> count_of_views(1), count_of_views(4)
+    ('one view', '4 views')
+    """
+    return "one view" if count == 1 else f"{count} views"
 
 
 def _own(file: Path) -> Measured:
@@ -102,7 +117,7 @@ def _measured(
     return Measured(
         protocol=name,
         description=description,
-        figures=numbers(figures),
+        figures=finite_numbers(file, figures),
         views=tuple(map(str, views)) if isinstance(views, list) and views else None,
         size=size if all(isinstance(side, int) for side in size) else None,
         outdated=is_outdated(file, run),

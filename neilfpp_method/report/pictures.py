@@ -82,15 +82,8 @@ def _views_data(views: ReportViews) -> dict[str, Any]:
     return {"names": list(views.names), "photographs": list(views.photographs), "layers": layers}
 
 
-def surface_section(packed: Mapping[str, Any] | None, reason: str) -> Html:
-    """Build the section with the surface in a viewer, or the reason why there is no surface.
-
-    Args:
-        packed: the surface from `packed_surface`, or None.
-        reason: why there is no surface.
-    """
-    if packed is None:
-        return element("p", f"There is no surface to show: {reason}.")
+def surface_section(packed: Mapping[str, Any]) -> Html:
+    """Build the section with the surface, from `packed_surface`, in a viewer."""
     layers = WITH_MATERIAL if "color" in packed else WITHOUT_MATERIAL
     return joined(
         _radios("surface-layer", "Layer", [(str(number), title) for number, title in layers.items()]),

@@ -8,8 +8,9 @@ from typing import Any
 from neilfpp_method.evaluate.glossary import style_of
 from neilfpp_method.health.cases import Finding, verdict_of
 from neilfpp_method.report.curves import quality_curve, work_bars
-from neilfpp_method.report.files import Changed
+from neilfpp_method.report.files import ChangedSetting
 from neilfpp_method.report.markup import Html, cell, element, joined, table, with_code
+from neilfpp_method.schedule import Stage
 from neilfpp_method.train.quality import QualityCheck
 
 __all__ = [
@@ -87,11 +88,9 @@ def figures_section(metrics: Mapping[str, float], description: str) -> Html:
     """Build a table with a row per figure; `x_frame` and `baseline_x` are columns in the row of `x`.
 
     Args:
-        metrics: figures by name.
-        description: how they were measured, or why there are none.
+        metrics: figures by name; at least one.
+        description: how they were measured.
     """
-    if not metrics:
-        return element("p", description)
     companions = {name: (f"{name}_frame", f"baseline_{name}") for name in metrics}
     titles = ("whole frame", "naive baseline")
     filled = [k for k in range(len(titles)) if any(pair[k] in metrics for pair in companions.values())]
@@ -119,22 +118,37 @@ def figures_section(metrics: Mapping[str, float], description: str) -> Html:
 
 
 def time_section(
-    timing: Mapping[str, float],
+    stages: Mapping[str, float],
     work: Mapping[str, Mapping[str, float]],
     checks: Sequence[QualityCheck],
-    previews: Sequence[tuple[str, str]],
+    previews: Mapping[str, str],
 ) -> Html:
     """Build the section with the time of each stage by kind of work, quality over time, and previews.
 
     Args:
-        timing: seconds by stage.
-        work: seconds by stage and kind of work; if not empty, it replaces `timing`.
+        stages: seconds by stage.
+        work: seconds by stage and kind of work; empty if they are not known.
         checks: measurements at held-back pixels during training.
-        previews: stage and data URL of the image at the end of each stage.
+        previews: data URL of the image at the end of each stage, by stage.
     """
-    stages = {stage: sum(parts.values()) for stage, parts in work.items()} or dict(timing)
     if not stages:
         return element("p", "No stage has been timed.")
+    pictures = (
+        element(
+            "figure",
+            element("img", class_="map", src=url, alt=f"Preview at the end of {stage}"),
+            element("figcaption", f"End of {STAGE_TITLES.get(stage, stage)}: {_panels_of(stage)}"),
+        )
+        for stage, url in previews.items()
+    )
+    curve = quality_curve(checks)
+    caption = "Quality during training at held-back pixels, small patches of training views:"
+    caption = element("p", caption, class_="pale") if curve else None
+    return joined(_time_table(stages, work), work_bars(work, STAGE_TITLES), caption, curve, *pictures)
+
+
+def _time_table(stages: Mapping[str, float], work: Mapping[str, Mapping[str, float]]) -> Html:
+    """A row for each stage with its largest kinds of work, and one for the total."""
     total = sum(stages.values())
     rows = [
         element(
@@ -154,23 +168,13 @@ def time_section(
             *(2 * [element("td")]),
         )
     )
-    pictures = (
-        element(
-            "figure",
-            element("img", class_="map", src=url, alt=f"Preview at the end of {stage}"),
-            element(
-                "figcaption",
-                f"End of {STAGE_TITLES.get(stage, stage)}: photograph, R, normal, then PBR, base colour, "
-                "roughness, metallic",
-            ),
-        )
-        for stage, url in previews
-    )
-    times = table(("stage", "time", "", "largest parts"), *rows)
-    curve = quality_curve(checks)
-    caption = "Quality during training at held-back pixels, small patches of training views:"
-    caption = element("p", caption, class_="pale") if curve else None
-    return joined(times, work_bars(work, STAGE_TITLES), caption, curve, *pictures)
+    return table(("stage", "time", "", "largest parts"), *rows)
+
+
+def _panels_of(stage: str) -> str:
+    """The panels of the preview of a stage, from left to right (`train.preview`)."""
+    geometry = "photograph, R, normal"
+    return geometry if stage == Stage.SDF_INIT.value else f"{geometry}, PBR, base colour, roughness, metallic"
 
 
 def _bar(share: float) -> Html:
@@ -201,7 +205,7 @@ def effects_section(rows: Sequence[Mapping[str, Any]]) -> Html:
     return table(("effect", "decision", "reason", "cost if on", "risk if left out"), *lines)
 
 
-def settings_section(preset: str, changed: Sequence[Changed] | None) -> Html:
+def settings_section(preset: str, changed: Sequence[ChangedSetting] | None) -> Html:
     """Build the table of settings that differ from the preset; None if the preset is not known."""
     if changed is None:
         return element(

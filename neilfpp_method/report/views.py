@@ -9,16 +9,19 @@ import numpy as np
 from jaxtyping import Float
 
 from neilfpp_method.data.scaling import at_scale, file_size
-from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
+from neilfpp_method.evaluate.confidence import DISPLAY_STEP, measure_residuals, with_deviation
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.map_metrics import image_metrics, material_metrics, normal_metrics
 from neilfpp_method.evaluate.panels import ComparedMap, albedo_scale, compared_maps
 from neilfpp_method.evaluate.pictures import Section
-from neilfpp_method.evaluate.views import RenderedView, known_test_views, render_view
-from neilfpp_method.report.encoded import encoded
+from neilfpp_method.evaluate.views import RenderedView, evenly_spread, known_test_views, render_view
+from neilfpp_method.report.data_urls import image_url
 from neilfpp_method.train.run import Run
 
 __all__ = [
+    "MAX_SIZE",
+    "MAX_VIEWS",
+    "MIN_SIZE",
     "Cell",
     "ComparedViews",
     "Layer",
@@ -26,15 +29,16 @@ __all__ = [
     "ReportViews",
     "compare_views",
     "encode_views",
-    "evenly_spread",
     "run_for_display",
     "title_of",
 ]
 
 TITLES = {"rgb": "Image, rendering equation", "rgb_volume": "Image, volume rendering"}
 """Titles of maps whose own title is ambiguous, by name."""
-CONFIDENCE_STEP = 2
-"""Expected errors are computed for every n-th pixel of every n-th row, to save time."""
+MAX_VIEWS = 64
+"""Largest number of views that a command shows; browsers open a larger page or image slowly."""
+MIN_SIZE, MAX_SIZE = 16, 2048
+"""Smallest and largest longest side of a shown view, pixels."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +117,6 @@ class ComparedViews:
     mask_source: str
 
 
-def evenly_spread(names: Sequence[str], count: int) -> tuple[str, ...]:
-    """Choose `count` of the names at even distances, or all if there are fewer.
-
-    >>> evenly_spread("abcde", 3)
-    ('a', 'c', 'e')
-    """
-    rows = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
-    return tuple(names[row] for row in rows)
-
-
 def run_for_display(run: Run, views: int, size: int) -> Run:
     """Return the run with a few small views held out, for display.
 
@@ -160,7 +154,7 @@ def compare_views(run: Run, confidence: bool, on_progress: Callable[[float], Non
     figures = image_metrics(run, pairs) | material_metrics(run, pairs) | normal_metrics(pairs)
     if confidence and run.has_material and run.capture.train_views:
         residuals = measure_residuals(run)
-        rendered = [with_deviation(run, residuals, view, CONFIDENCE_STEP) for view in rendered]
+        rendered = [with_deviation(run, residuals, view, DISPLAY_STEP) for view in rendered]
     maps = tuple(compared_maps(run, rendered, known, scale))
     return ComparedViews(tuple(rendered), scale, maps, figures, held.mask_source)
 
@@ -181,16 +175,16 @@ def encode_views(run: Run, confidence: bool, on_progress: Callable[[float], None
             f"{m.largest:g}{m.unit}",
             tuple(
                 Cell(
-                    encoded(c.estimate, c.hit),
-                    None if c.truth is None else encoded(c.truth, c.known),
-                    None if c.error is None else encoded(c.error, c.known),
+                    image_url(c.estimate, c.hit),
+                    None if c.truth is None else image_url(c.truth, c.known),
+                    None if c.error is None else image_url(c.error, c.known),
                 )
                 for c in m.comparisons
             ),
         )
         for m in compared.maps
     )
-    photographs = tuple(encoded(c.truth) for c in compared.maps[0].comparisons)
+    photographs = tuple(image_url(c.truth) for c in compared.maps[0].comparisons)
     camera = run.capture.test_views[0].camera
     light = _light(light_sections(run, compared.rendered, compared.scale)) if run.has_material else ()
     names = tuple(view.name for view in compared.rendered)
@@ -203,6 +197,6 @@ def _light(sections: Sequence[Section]) -> tuple[LightPicture, ...]:
         columns = [(group.title, column) for group in section.groups for column in group.columns]
         pictures = section.rows[0].pictures
         images += [
-            LightPicture(*c, encoded(p)) for c, p in zip(columns, pictures, strict=True) if p is not None
+            LightPicture(*c, image_url(p)) for c, p in zip(columns, pictures, strict=True) if p is not None
         ]
     return tuple(images)

@@ -6,20 +6,24 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
-from neilfpp_method.data.images import read_image, replacing
+from neilfpp_method.data.images import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.report import pictures, tables
-from neilfpp_method.report.encoded import encoded
-from neilfpp_method.report.files import Files, changed_settings, read_files
+from neilfpp_method.report.data_urls import image_url
+from neilfpp_method.report.files import RunFiles, changed_settings, read_files
 from neilfpp_method.report.light import lamps_of, picture_of_map
 from neilfpp_method.report.markup import Html, element, joined
-from neilfpp_method.report.measured import OWN, Measured
+from neilfpp_method.report.measured import OWN, Measured, count_of_views
 from neilfpp_method.report.page import PageSection, page
 from neilfpp_method.report.surface import packed_surface
-from neilfpp_method.report.views import ReportViews, encode_views, run_for_display
-from neilfpp_method.schedule import Stage
+from neilfpp_method.report.views import (
+    MAX_SIZE,
+    MAX_VIEWS,
+    MIN_SIZE,
+    ReportViews,
+    encode_views,
+    run_for_display,
+)
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.light_record import light_summary, read_fits
 from neilfpp_method.train.run import Run, load_run
@@ -29,12 +33,8 @@ __all__ = ["REPORT", "ReportOptions", "write_report"]
 REPORT = "report.html"
 RENDERING = 0.85
 """Fraction of the progress that rendering the views takes."""
-MAX_VIEWS = 64
-"""Largest number of views; more would make a page that browsers open slowly."""
 BEFORE_CHECKPOINT = "Training was stopped before its first checkpoint"
 """The reason why a report has no images."""
-MIN_SIZE, MAX_SIZE = 16, 2048
-"""Smallest and largest longest side of a view, pixels."""
 
 
 @dataclass(frozen=True)
@@ -102,13 +102,11 @@ def write_report(
     return out
 
 
-def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Callable[[float], None]) -> str:
+def _with_model(
+    run: Run, files: RunFiles, options: ReportOptions, on_progress: Callable[[float], None]
+) -> str:
     small = run_for_display(run, options.views, options.size)
     views = encode_views(small, options.confidence, lambda share: on_progress(RENDERING * share))
-    try:
-        surface, reason = packed_surface(small), ""
-    except UserError as error:
-        surface, reason = None, error.problem
     light = (
         light_summary(run.config.light, read_fits(run.path, run.step))
         if run.has_material
@@ -117,7 +115,7 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
     sections = [
         PageSection("health", "Health", tables.health_section(files.findings, list(_notes(run, files)))),
         PageSection("views", "Views", pictures.views_section(views, bool(run.capture.test_views))),
-        PageSection("surface", "Surface", pictures.surface_section(surface, reason)),
+        PageSection("surface", "Surface", _surface(small)),
         PageSection(
             "light", "Light", pictures.light_section(light, picture_of_map(run), lamps_of(run), views.light)
         ),
@@ -132,7 +130,15 @@ def _with_model(run: Run, files: Files, options: ReportOptions, on_progress: Cal
     return page(title, f"step {run.step} of {files.steps}", sections)
 
 
-def _notes(run: Run, files: Files) -> Iterator[str]:
+def _surface(run: Run) -> Html:
+    """The surface in a viewer, or the reason why there is none."""
+    try:
+        return pictures.surface_section(packed_surface(run))
+    except UserError as error:
+        return element("p", f"There is no surface to show: {error.problem}.")
+
+
+def _notes(run: Run, files: RunFiles) -> Iterator[str]:
     """What the reader should know first: what is missing in the run or its capture, and damaged files."""
     if run.step < files.steps:
         stopped = f"Training was stopped after step {run.step} of {files.steps}."
@@ -152,7 +158,7 @@ def _notes(run: Run, files: Files) -> Iterator[str]:
         )
 
 
-def _without_model(files: Files) -> str:
+def _without_model(files: RunFiles) -> str:
     note = f"{BEFORE_CHECKPOINT}. {_how_to_continue(files.path)}"
     sections = [
         PageSection("health", "Health", tables.health_section(files.findings, [note, *files.notes])),
@@ -166,18 +172,18 @@ def _how_to_continue(path: Path) -> str:
     return f"To continue: neilfpp train --out {path} --resume"
 
 
-def _from_files(files: Files) -> list[PageSection]:
+def _from_files(files: RunFiles) -> list[PageSection]:
     settings = tables.settings_section(files.config.preset, changed_settings(files.config))
+    previews = {stage: image_url(pixels) for stage, pixels in files.previews.items()}
+    time = tables.time_section(files.seconds, files.work, files.checks, previews)
     return [
-        PageSection(
-            "time", "Time", tables.time_section(files.timing, files.work, files.checks, _previews(files.path))
-        ),
+        PageSection("time", "Time", time),
         PageSection("effects", "Effects", tables.effects_section(files.effects)),
         PageSection("settings", "Settings", settings),
     ]
 
 
-def _figures(run: Run, files: Files, views: ReportViews) -> Html:
+def _figures(run: Run, files: RunFiles, views: ReportViews) -> Html:
     """Tables of figures, one per protocol; if none was measured, the figures of the views in the report."""
     if files.measured:
         sections = (
@@ -189,10 +195,13 @@ def _figures(run: Run, files: Files, views: ReportViews) -> Html:
         )
         return joined(*sections)
     if not run.capture.test_views:
-        return tables.figures_section({}, "Nothing was measured, because no view is held out.")
+        return element("p", "Nothing was measured, because no view is held out.")
+    if not views.figures:
+        return element("p", "Nothing was measured, because the views in this report show no surface.")
     description = (
-        f"These figures are of the {len(views.names)} views in this report, at {views.width}×{views.height} "
-        f"pixels. They are not the figures of the protocol neilfpp, which `neilfpp eval {run.path}` measures."
+        f"These figures are of the views in this report: {count_of_views(len(views.names))} of "
+        f"{views.width}×{views.height} pixels. They are not the figures of the protocol neilfpp, which "
+        f"`neilfpp eval {run.path}` measures."
     )
     return tables.figures_section(views.figures, description)
 
@@ -207,17 +216,7 @@ def _description(measured: Measured) -> str:
     return f"Measured by `neilfpp eval{option}`{details}.{outdated}"
 
 
-def _previews(path: Path) -> list[tuple[str, str]]:
-    """Stage and data URL of the preview images that exist."""
-    previews = []
-    for stage in Stage:
-        file = path / "previews" / f"{stage.value}.png"
-        if file.is_file():
-            previews.append((stage.value, encoded((read_image(file).pixels * 255).round().astype(np.uint8))))
-    return previews
-
-
-def _facts(files: Files) -> dict[str, str]:
+def _facts(files: RunFiles) -> dict[str, str]:
     """Settings and hardware for display, by title."""
     shading, machine = files.config.shading, files.machine
     facts = {
@@ -233,7 +232,7 @@ def _facts(files: Files) -> dict[str, str]:
         facts["Processor"] = (
             f"{machine.get('processor')}, {machine.get('cores')} cores, {machine.get('threads')} threads"
         )
-        facts["GPU"] = ", ".join(map(str, machine.get("gpus") or [])) or "none"
+        facts["GPU"] = ", ".join(files.gpus) or "none"
         packages = machine.get("packages")
         versions = packages.items() if isinstance(packages, dict) else ()
         facts["Versions"] = ", ".join(f"{name} {version}" for name, version in versions)

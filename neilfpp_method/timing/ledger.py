@@ -10,8 +10,8 @@ A ledger attributes every moment to exactly one kind: within `timed("tracing")` 
 "rest".
 
 On a GPU the host clock shows when work is submitted, not when it is done. With `synchronize`, the ledger
-waits for the device whenever the kind of work changes, but only in one of `EVERY` steps (a sampled step). The
-time of the other steps of a stage is divided in the proportions of the sampled ones.
+waits for the device whenever the kind of work changes, but only in one of `SAMPLE_INTERVAL` steps (a sampled
+step). The time of the other steps of a stage is divided in the proportions of the sampled ones.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ContextDecorator, contextmanager
 from typing import Literal, NamedTuple, get_args
 
-__all__ = ["EVERY", "PREPARATION", "WORK", "Ledger", "Work", "recording", "timed"]
+__all__ = ["PREPARATION", "SAMPLE_INTERVAL", "WORK", "Ledger", "Work", "recording", "timed"]
 
 Work = Literal[
     "data",
@@ -54,19 +54,19 @@ WORK: tuple[Work, ...] = get_args(Work)
 """All kinds of work."""
 PREPARATION = "preparation"
 """Name of the time before the first stage, in which images are read and the model is built."""
-EVERY = 200
+SAMPLE_INTERVAL = 200
 """On a GPU, one in this many steps is sampled. A sampled step takes at most about twice as long, so this
 costs at most half a per cent (an estimate; it has not been measured on a GPU).
 """
-FIRST = 10
-"""On a GPU, the first sampled step of a stage. The steps before it compile and allocate."""
+FIRST_SAMPLE = 10
+"""On a GPU, the index of the first sampled step of a stage. The steps before it compile and allocate."""
 
 
 class Mark(NamedTuple):
-    """A kind of work, and whether marks within it are ignored; see `timed`."""
+    """A kind of work, and whether all work within it counts as that kind; see `timed`."""
 
     work: Work
-    apart: bool
+    undivided: bool
 
 
 class Ledger:
@@ -86,7 +86,7 @@ class Ledger:
         self._unsampled: dict[str, float] = {}
         self._sampled: dict[str, dict[str, float]] = {}
         self._synchronize, self._now = synchronize, now
-        self._stage, self._mark = PREPARATION, Mark("rest", apart=False)
+        self._stage, self._mark = PREPARATION, Mark("rest", undivided=False)
         self._in_step = False
         self._samples = synchronize is None
         self._since = now()
@@ -127,7 +127,7 @@ class Ledger:
         """Mark a training step, by its number in the stage."""
         self._count()
         self._in_step = True
-        self._samples = self._synchronize is None or number % EVERY == FIRST
+        self._samples = self._synchronize is None or number % SAMPLE_INTERVAL == FIRST_SAMPLE
         self._wait()
         try:
             yield
@@ -139,9 +139,9 @@ class Ledger:
     def begin(self, mark: Mark) -> Mark:
         """Begin another kind of work; see `timed`. Returns the mark of the previous one, for `restore`."""
         before = self._mark
-        if not before.apart:
-            if mark.apart or self._samples:
-                self._wait(always=mark.apart)
+        if not before.undivided:
+            if mark.undivided or self._samples:
+                self._wait(always=mark.undivided)
                 self._count()
             self._mark = mark
         return before
@@ -150,8 +150,8 @@ class Ledger:
         """Return to the kind of work whose mark `begin` returned."""
         if before == self._mark:
             return
-        if self._mark.apart or self._samples:
-            self._wait(always=self._mark.apart)
+        if self._mark.undivided or self._samples:
+            self._wait(always=self._mark.undivided)
             self._count()
         self._mark = before
 
@@ -163,11 +163,11 @@ class Ledger:
         """Attribute the time since the last call to the current kind of work."""
         now = self._now()
         passed, self._since = now - self._since, now
-        if self._in_step and not self._mark.apart and not self._samples:
+        if self._in_step and not self._mark.undivided and not self._samples:
             self._unsampled[self._stage] = self._unsampled.get(self._stage, 0.0) + passed
             return
         targets = [self._seconds]
-        if self._in_step and not self._mark.apart and self._synchronize is not None:
+        if self._in_step and not self._mark.undivided and self._synchronize is not None:
             targets.append(self._sampled)
         for seconds in targets:
             parts = seconds.setdefault(self._stage, {})
@@ -200,12 +200,13 @@ class timed(ContextDecorator):
 
     Args:
         work: the kind of work.
-        apart: whether marks within the context are ignored, as in a fit of the light that traces rays. The
-            ledger then always waits for the device, since such work is rare and not part of every step.
+        undivided: whether all work within the context counts as `work`, as in a fit of the light that traces
+            rays. The ledger then always waits for the device, since such work is rare and not part of every
+            step.
     """
 
-    def __init__(self, work: Work, apart: bool = False) -> None:
-        self._mark = Mark(work, apart)
+    def __init__(self, work: Work, undivided: bool = False) -> None:
+        self._mark = Mark(work, undivided)
         self._before: list[_Interrupted | None] = []
 
     def __enter__(self) -> None:

@@ -173,12 +173,12 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
     """Raise a `UserError` unless the cameras see the outside of the mesh."""
     cameras = [capture.scene_camera(view) for view in capture.train_views]
-    met = [host.cross(camera_rays(camera)[::VISIBILITY_STRIDE]) for camera in cameras]
-    outside = torch.cat([crossings.outside for crossings in met])
+    met = [host.intersect(camera_rays(camera)[::VISIBILITY_STRIDE]) for camera in cameras]
+    outside = torch.cat([hits.outside for hits in met])
     if not len(outside):
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
-        reach = torch.cat([crossings.position for crossings in met]).norm(dim=-1).median().item()
+        reach = torch.cat([hits.position for hits in met]).norm(dim=-1).median().item()
         if reach > LARGE:
             raise UserError(
                 f"{path}: the cameras are inside of this mesh, half of which is {reach:.3g} or more scene "

@@ -50,7 +50,7 @@ def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
         return
     if fabric.is_global_zero:
         run.watch.after_fit(solver.points, step)
-        with timed("light_fits", apart=True):
+        with timed("light_fits", undivided=True):
             evidence = solver.solve(run.model.brdf, run.model.scene)
         lamps = run.model.lamps.count
         note_fit(run.fits, evidence, lamps, step)
@@ -67,7 +67,7 @@ def _share_light(run: Training) -> None:
 
 def review_before_stage(run: Training, step: int) -> None:
     """Take the measurements before a stage that trains material."""
-    if run.model.stages[stage_at(step, run.config.train).stage].moves_material:
+    if run.model.stages[stage_at(step, run.config.train).stage].trains_material:
         _review_effects(run, step, review_surface, Stream.SURFACE)
         _start_light(run, step)
         _review_effects(run, step, review_material, Stream.MATERIAL)
@@ -102,7 +102,7 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
     if max_pixels < MIN_PIXELS or not is_search_due(model, position):
         return
     if run.fabric.is_global_zero:
-        with timed("light_fits", apart=True):
+        with timed("light_fits", undivided=True):
             seed_stream(run.config.train.seed, Stream.SEARCH, step)
             summary = improve_material(model, light_places(model, run.pixels, max_pixels))
         if summary is not None:

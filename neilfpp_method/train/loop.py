@@ -83,13 +83,13 @@ def train(run: Training) -> None:
         position = stage_at(step, run.config.train)
         step = _train_stage(run, optimizer, position, step)
         if run.fabric.is_global_zero:
-            with timed("checks", apart=True):
+            with timed("checks", undivided=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
         if step < total_steps(run.config.train):
-            with timed("checks", apart=True):
+            with timed("checks", undivided=True):
                 review_before_stage(run, step)
         _save(run, optimizer, step, names=(position.stage.value, LAST))
-        with timed("checks", apart=True):
+        with timed("checks", undivided=True):
             model.eval()
             run.preview(model, position.stage)
             model.train()
@@ -173,7 +173,7 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
     return stage_steps(revised)[position.stage]
 
 
-@timed("checks", apart=True)
+@timed("checks", undivided=True)
 def _check_quality(run: Training, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
         run.quality.check_when_due(run.model, position, step, run.ledger.total)
@@ -259,7 +259,7 @@ def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:
 # ------------------------------------------------------------------------------------------- state and record
 
 
-@timed("saving", apart=True)
+@timed("saving", undivided=True)
 def _save(run: Training, optimizer: torch.optim.Optimizer, step: int, names: Sequence[str] = (LAST,)) -> None:
     """Write the records of the run, and its state as checkpoints of these names."""
     if run.fabric.is_global_zero:

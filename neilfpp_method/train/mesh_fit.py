@@ -52,7 +52,7 @@ def measure_mesh_fit(host: MeshHost, pixels: PixelDataset) -> MeshFit:
     numbers = torch.randint(len(pixels), (PIXELS,), generator=torch.Generator().manual_seed(0))
     batch = pixels.on(host.triangles.device).numbered(numbers)
     meets = torch.zeros_like(batch.mask, dtype=torch.bool)
-    meets[host.cross(batch.rays).rows] = True
+    meets[host.intersect(batch.rays).rows] = True
     # Some views may have no mask. If the background is recognised by its colour, only its pixels are known.
     known = torch.isin(batch.view, batch.view[batch.mask_known > 0.5])
     inside = batch.mask > 0.5

@@ -43,7 +43,7 @@ def write_preview(model: NeilfModel, capture: Capture, stage: Stage, path: Path)
     shape = (view.camera.height, view.camera.width, 3)
     panels = [_photograph(view, capture.hdr, model.facts.response)]
     rays = camera_rays(capture.scene_camera(view))
-    panels += [p.reshape(shape) for p in _panels(model, rays, model.stages[stage].moves_material)]
+    panels += [p.reshape(shape) for p in _panels(model, rays, model.stages[stage].trains_material)]
     picture = np.concatenate([(p.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8) for p in panels], axis=1)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, picture)
@@ -66,11 +66,8 @@ def _photograph(view: View, hdr: bool, response: str) -> np.ndarray:
 
 
 def _panels(model: NeilfModel, rays: RayBatch, with_material: bool) -> list[np.ndarray]:
-    device = next(model.parameters()).device
-    chunks = [
-        model.maps(rays[start : start + EVAL_RAYS].to(device), with_material)
-        for start in range(0, len(rays), EVAL_RAYS)
-    ]
+    device, render = next(model.parameters()).device, model.maps if with_material else model.host_maps
+    chunks = [render(rays[i : i + EVAL_RAYS].to(device)) for i in range(0, len(rays), EVAL_RAYS)]
 
     def joined(name: str) -> Tensor:
         return torch.cat([getattr(chunk, name) for chunk in chunks]).float().cpu()

@@ -85,7 +85,7 @@ class Quality:
         if not len(self.pixels) or not self._due(position, step, seconds):
             return
         began = time.perf_counter()
-        psnr = _measure(model, self.pixels, model.stages[position.stage].moves_material)
+        psnr = _measure(model, self.pixels, model.stages[position.stage].trains_material)
         took = time.perf_counter() - began
         # A model that is not finite is reported by `health`.
         if math.isfinite(psnr.radiance) and math.isfinite(psnr.physical or 0.0):
@@ -112,7 +112,7 @@ class _Measured:
 @torch.no_grad()
 def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> _Measured:
     with model.evaluating():
-        maps = model.maps(pixels.rays, with_material)
+        maps = model.maps(pixels.rays) if with_material else model.host_maps(pixels.rays)
     photograph = display_values(pixels.color, model.facts.response)
     physical = _psnr(tone_map(maps.rgb), photograph) if with_material else None
     return _Measured(_psnr(tone_map(maps.rgb_volume), photograph), physical)

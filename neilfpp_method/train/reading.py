@@ -16,7 +16,7 @@ from neilfpp_method.timing.ledger import timed
 __all__ = ["load_training_pixels"]
 
 
-@timed("data", apart=True)
+@timed("data", undivided=True)
 def load_training_pixels(capture: Capture, folder: Path, fabric: Fabric, console: Console) -> PixelDataset:
     """Read the training pixels into a folder in the first process, and open them there in all processes.
 

@@ -54,6 +54,7 @@ __all__ = [
     "Description",
     "Run",
     "check_free",
+    "check_material",
     "create_run",
     "load_run",
     "read_description",
@@ -153,6 +154,16 @@ class Run:
     def device(self) -> torch.device:
         """Device of the model, on which its points and rays must be."""
         return next(self.model.parameters()).device
+
+
+def check_material(run: Run) -> None:
+    """Check that a run has a material.
+
+    Raises:
+        UserError: if no stage has estimated it yet.
+    """
+    if not run.has_material:
+        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
 
 
 def run_folder(path: Path) -> Path:

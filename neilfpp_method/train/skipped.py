@@ -54,7 +54,7 @@ class Moment:
         The replay buffer, some hundred kilobytes, is copied if the step uses it.
         """
         replay = {}
-        if not model.stages[position.stage].moves_host:
+        if not model.stages[position.stage].trains_host:
             state = model.replay.state_dict(prefix="replay.")
             replay = {name: v.clone() if isinstance(v, Tensor) else dict(v) for name, v in state.items()}
         return Moment(batch, position, step, torch.get_rng_state(), replay)

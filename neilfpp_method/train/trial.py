@@ -196,7 +196,7 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     """
     setup = _set_up(work)
     lengths = {stage: steps for stage, steps in stage_steps(setup.config.train).items() if steps}
-    with_material = [stage for stage in lengths if setup.model.stages[stage].moves_material]
+    with_material = [stage for stage in lengths if setup.model.stages[stage].trains_material]
     places = _seconds_of_places(setup)
     if places * len(with_material) > limits.places:
         places = 0.0
@@ -298,7 +298,7 @@ def _steps_per_fit(config: NeilfConfig) -> int:
 
 def _measure_stage(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
     """Time the steps of a stage for about `limit` seconds, and its picture and health check."""
-    model, with_material = setup.model, setup.model.stages[stage].moves_material
+    model, with_material = setup.model, setup.model.stages[stage].trains_material
     times = _train_steps(setup, stage, limit)
     model.eval()
     times.picture = _picture_seconds(setup, with_material)
@@ -317,7 +317,7 @@ def _train_steps(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
     model, solver, optimizer, config = setup.model, setup.solver, setup.optimizer, setup.trial_config
     model.freeze_for(stage)
     times, began = _StageTimes(), time.perf_counter()
-    fits = model.stages[stage].moves_material and not isinstance(solver, NothingToSolve)
+    fits = model.stages[stage].trains_material and not isinstance(solver, NothingToSolve)
     gradients = "smoothness" in active_losses(stage, config, model.stages)
     for number in range(WARM_STEPS + MAX_STEPS):
         step_began = time.perf_counter()
@@ -352,8 +352,8 @@ def _review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset) -> None
 
 def _picture_seconds(setup: _Setup, with_material: bool) -> float:
     """Estimate the time of the picture at the end of a stage from that of some of its rays."""
-    model = setup.model
+    render = setup.model.maps if with_material else setup.model.host_maps
     warm, timed = (setup.pixels.sample(count, gradients=False).rays for count in (WARM_RAYS, PICTURE_RAYS))
-    once = setup.seconds(lambda: model.maps(warm, with_material))
-    part = setup.seconds(lambda: model.maps(timed, with_material))
+    once = setup.seconds(lambda: render(warm))
+    part = setup.seconds(lambda: render(timed))
     return once + part * preview_pixels(setup.capture) / PICTURE_RAYS

@@ -39,7 +39,7 @@ def viewer_beside(
         UserError: viser is not installed, or the port is not free.
     """
     check_viser()
-    check_address(HOST, port)
+    check_address(HOST, port, "--view-port")
     words = ["view", str(run), "--follow", "--host", HOST, "--port", str(port), "--device", device]
     with tempfile.TemporaryFile() as errors:
         process = subprocess.Popen(

@@ -82,8 +82,8 @@ def _by_paths(
     nearest = torch.full_like(directions[:, 0], torch.inf).index_put((hits.rows,), hits.distance)
     radiance = total / SAMPLES + nearest.isinf()[:, None] * scene.sky.lookup(directions)
     for lamp in range(0 if light.lamps is None else len(light.lamps.position)):
-        distance, emitted = light.lamps.intersect(origins, directions, lamp)
-        radiance = radiance + (distance < nearest)[:, None] * emitted
+        met = light.lamps.intersect(origins, directions, lamp)
+        radiance = radiance + (met.distance < nearest)[:, None] * met.radiance
     return radiance
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.cli import main
-from neilfpp_method.compare.contenders import labels_of
+from neilfpp_method.compare.runs import labels_of
 from neilfpp_method.compare.sheet import shortened
 from neilfpp_method.compare.write import compare_runs
 from neilfpp_method.data.images import image_header, read_image

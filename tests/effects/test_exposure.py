@@ -180,8 +180,8 @@ def test_shading_and_light_use_the_mean_exposure(response):
 def test_gains_are_in_checkpoints_and_train_with_R():
     model = exposed_model("linear", torch.tensor([[0.2] * 3, [-0.2] * 3]))
     assert {"gains.log_gain", "gains.start"} <= set(model.state_dict())
-    moving = {stage: "exposure" in model.stages[stage].moves for stage in Stage}
-    assert moving == {Stage.SDF_INIT: True, Stage.MATERIAL_INIT: False, Stage.JOINT: True}
+    trained = {stage: "exposure" in model.stages[stage].trains for stage in Stage}
+    assert trained == {Stage.SDF_INIT: True, Stage.MATERIAL_INIT: False, Stage.JOINT: True}
 
 
 @pytest.mark.parametrize("response", ["linear", "srgb"])

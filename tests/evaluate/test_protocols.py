@@ -53,7 +53,12 @@ class KnownSphere(NeilfModel):
         self.host = SimpleNamespace(sdf=lambda x: x.norm(dim=-1) - SPHERE)
         self.sizes: list[int] = []
 
-    def maps(self, rays: RayBatch, with_material: bool = True) -> Maps:
+    def host_maps(self, rays: RayBatch) -> Maps:
+        maps = self.maps(rays)
+        names = ("base_color", "roughness", "metallic")
+        return dataclasses.replace(maps, **{name: torch.zeros_like(getattr(maps, name)) for name in names})
+
+    def maps(self, rays: RayBatch) -> Maps:
         self.sizes.append(len(rays))
         middle = -(rays.origins * rays.directions).sum(-1)
         inside = middle**2 - rays.origins.square().sum(-1) + SPHERE**2
@@ -67,8 +72,6 @@ class KnownSphere(NeilfModel):
         )
         ones = hit.float()
         material = (base_color, scene.ROUGHNESS * ones, scene.METALLIC * ones)
-        if not with_material:
-            material = tuple(torch.zeros_like(m) for m in material)
         return Maps(color, color, color, torch.zeros_like(color), *material, normal, depth * ones, ones)
 
     def incident_light(self, x: torch.Tensor, wi: torch.Tensor) -> torch.Tensor:

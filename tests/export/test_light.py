@@ -155,6 +155,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
         (make_run(tmp_path / "many", "distant"), 1025, "1025 probes"),
         (make_run(tmp_path / "fewer", "distant"), -1, "-1 probes"),
         (make_run(tmp_path / "empty", "free", radius=0.0), None, "no training view sees a surface"),
+        (make_run(tmp_path / "also-empty", "distant", radius=0.0), 3, "no training view sees a surface"),
     ):
         with pytest.raises(UserError, match=complaint):
             export_light(run, tmp_path / "light", probes)

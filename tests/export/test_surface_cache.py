@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from neilfpp_method.export import surface_cache
-from neilfpp_method.export.surface_cache import ExtractedSurface, extracted_surface
+from neilfpp_method.export.surface_cache import ShadedSurface, extracted_surface, shaded_surface
 from neilfpp_method.relight.recovered import surface_of_run
 from neilfpp_method.train.run import Run, load_run
 from tests.calls import train_tiny
@@ -53,11 +53,11 @@ def file(run: Run) -> Path:
     return run.path / "cache" / f"surface-{RESOLUTION}.npz"
 
 
-def shaded(run: Run, say: Callable[[str], None] = lambda text: None) -> ExtractedSurface:
-    return extracted_surface(run, RESOLUTION, shaded=True, say=say)
+def shaded(run: Run, say: Callable[[str], None] = lambda text: None) -> ShadedSurface:
+    return shaded_surface(run, RESOLUTION, say)
 
 
-def same(one: ExtractedSurface, other: ExtractedSurface) -> bool:
+def same(one: ShadedSurface, other: ShadedSurface) -> bool:
     pairs = zip(vars(one).values(), vars(other).values(), strict=True)
     return all(np.array_equal(a, b) and a.dtype == b.dtype for a, b in pairs)
 
@@ -75,7 +75,7 @@ def test_the_second_time_nothing_is_extracted_and_every_bit_is_the_same(run, ext
 
 
 def test_normals_are_added_to_a_surface_that_was_kept_without(run, extractions, monkeypatch):
-    assert extracted_surface(run, RESOLUTION, shaded=False).normals is None
+    assert extracted_surface(run, RESOLUTION).normals is None
     assert shaded(run).normals is not None
     assert extractions == [RESOLUTION]
     monkeypatch.setattr(
@@ -86,7 +86,7 @@ def test_normals_are_added_to_a_surface_that_was_kept_without(run, extractions, 
 
 def test_another_resolution_has_its_own_file(run, extractions):
     shaded(run)
-    extracted_surface(run, 40, shaded=False)
+    extracted_surface(run, 40)
     assert extractions == [RESOLUTION, 40]
     assert {path.name for path in file(run).parent.iterdir()} == {"surface-32.npz", "surface-40.npz"}
 
@@ -208,5 +208,5 @@ def test_a_folder_that_cannot_be_written(run):
 
 
 def test_a_surface_that_is_not_to_be_kept_is_not_written(run):
-    extracted_surface(run, RESOLUTION, shaded=False, keep=False)
+    extracted_surface(run, RESOLUTION, keep=False)
     assert not file(run).parent.exists()

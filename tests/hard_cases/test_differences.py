@@ -72,11 +72,11 @@ def pixels() -> PixelBatch:
     return dataclasses.replace(batch, **{name: value.double() for name, value in floats.items()})
 
 
-def assert_slopes(model: NeilfModel, value: Callable[[], Tensor], moves: frozenset[str]) -> None:
+def assert_slopes(model: NeilfModel, value: Callable[[], Tensor], trained: frozenset[str]) -> None:
     """Compare the slope of `value` along random directions of each field's parameters, by autograd and by
     differences.
     """
-    groups = {name: p for name, p in model.parameter_groups().items() if name in moves}
+    groups = {name: p for name, p in model.parameter_groups().items() if name in trained}
     slopes = {}
     for name, parameters in groups.items():
         gradient = torch.autograd.grad(value(), parameters, allow_unused=True, materialize_grads=True)
@@ -106,8 +106,8 @@ def test_renders_of_the_host(samples_stay, output):
     def value() -> Tensor:
         return (weight * getattr(model.host.render(batch.rays), output)).sum()
 
-    moves = frozenset(model.parameter_groups()) - {"brdf", "light"}
-    assert_slopes(model, value, moves)
+    trained = frozenset(model.parameter_groups()) - {"brdf", "light"}
+    assert_slopes(model, value, trained)
 
 
 @pytest.mark.parametrize("light", ["free", "map"])
@@ -122,6 +122,6 @@ def test_slopes_of_all_losses_of_a_step_agree_with_differences(samples_stay, lig
         torch.manual_seed(5)
         return weigh(model.losses(batch, stage), weights).loss
 
-    moves = model.stages[stage].moves & set(model.parameter_groups())
-    moves = frozenset(name for name in moves if model.parameter_groups()[name])
-    assert_slopes(model, value, moves)
+    trained = model.stages[stage].trains & set(model.parameter_groups())
+    trained = frozenset(name for name in trained if model.parameter_groups()[name])
+    assert_slopes(model, value, trained)

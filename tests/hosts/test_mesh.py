@@ -65,7 +65,7 @@ SPHERE = trimesh.creation.icosphere(subdivisions=5, radius=0.7)
 def tracer(request, monkeypatch) -> str:
     """Both implementations of first hits."""
     if request.param == "tree":
-        monkeypatch.setattr("neilfpp_method.hosts.mesh.embree_tracer", lambda triangles: None)
+        monkeypatch.setattr("neilfpp_method.hosts.mesh_tracing.embree_tracer", lambda triangles: None)
     return request.param
 
 
@@ -181,7 +181,8 @@ def test_the_tree_agrees_with_embree(monkeypatch):
     # nothing.
     same = found == expected
     depths = [
-        mesh_tracing.meet(rays.origins, rays.directions, triangles[t]).distance for t in (found, expected)
+        mesh_tracing.intersect_planes(rays.origins, rays.directions, triangles[t]).distance
+        for t in (found, expected)
     ]
     assert ((depths[0] - depths[1]).abs()[~same] < 1e-5).all()
     assert torch.equal(found >= 0, expected >= 0)

@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.hosts.function import CallableHost
-from neilfpp_method.hosts.proxy import EVERY, SurfaceProxy
+from neilfpp_method.hosts.proxy import REFRESH_INTERVAL, SurfaceProxy
 from neilfpp_method.structures import RayBatch, SceneLight
 from tests.hosts.table import CENTER, RADIUS, TableTop, camera_rays_above
 
@@ -116,11 +116,11 @@ def test_the_proxy_follows_a_host_that_changes():
     proxy = gathered(TableTop(), steps=4)
     moved = TableTop(lift=0.25)
     before = compare(moved, proxy)
-    gathered(moved, steps=2 * EVERY, proxy=proxy)
+    gathered(moved, steps=2 * REFRESH_INTERVAL, proxy=proxy)
     after = compare(moved, proxy)
     assert before.agreement < 0.9
     assert after.agreement > 0.96
-    assert proxy.report().age < 2 * EVERY
+    assert proxy.report().age < 2 * REFRESH_INTERVAL
 
 
 def test_an_empty_proxy_occludes_nothing():

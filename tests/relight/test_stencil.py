@@ -12,6 +12,7 @@ from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
+from neilfpp_method.relight import stencil
 from neilfpp_method.relight.stencil import masked_limit, read_stencils
 from neilfpp_method.relight.surface import Surface
 from tests.data.make_capture import RADIUS, SCALE, make_capture
@@ -101,3 +102,9 @@ def test_transparent_pixels_do_not_count(capture, surface, tmp_path):
 def test_invalid_masks_are_refused(capture, tmp_path, name, pixels, words):
     with pytest.raises(UserError, match=words):
         read_stencils([mask(tmp_path, name, pixels)], capture)
+
+
+def test_a_mask_that_is_too_large_is_refused(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(stencil, "MAX_SIDE", 40)
+    with pytest.raises(UserError, match="the mask has 48×36 pixels; reduce it to at most 40"):
+        read_stencils([mask(tmp_path, "001", np.ones((36, 48, 1)))], capture)

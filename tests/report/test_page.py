@@ -50,6 +50,11 @@ class Page(HTMLParser):
         self._block = given.get("id") if tag == "script" else None
         self.scripts += tag == "script" and self._block is None
 
+    @property
+    def captions(self) -> list[str]:
+        """The captions of the figures."""
+        return [unescape(text) for text in re.findall(r"<figcaption>(.*?)</figcaption>", self.html)]
+
     def handle_data(self, data: str) -> None:
         if self._block:
             self.data[self._block] = json.loads(data)
@@ -215,9 +220,31 @@ def test_effects_and_times_are_shown_if_they_are_recorded(run: Path):
     assert "rendering 75 %" in text
 
 
-def test_a_damaged_side_file_is_named_and_left_out(run: Path):
-    (run / "timing.json").write_text("{")
-    assert "timing.json: not readable as JSON" in page_of(run).text
+@pytest.mark.parametrize(
+    ("name", "contents", "said"),
+    [
+        ("timing.json", "{", "timing.json: not readable as JSON"),
+        ("timing.json", '{"sdf_init": NaN}', "timing.json: sdf_init is not a finite number"),
+        ("metrics.json", f'{{"pbr_psnr": 1{400 * "0"}}}', "metrics.json: pbr_psnr is not a finite number"),
+        ("previews/joint.png", "no image", "previews/joint.png"),
+        ("environment.json", '{"gpus": 5}', "none"),
+    ],
+)
+def test_a_damaged_side_file_is_named_and_left_out(run: Path, name: str, contents: str, said: str):
+    (run / name).write_text(contents)
+    assert said in page_of(run).text
+
+
+def test_each_preview_is_described_by_its_panels(run: Path):
+    captions = [line for line in page_of(run).captions if line.startswith("End of ")]
+    assert captions == [
+        "End of SDF init: photograph, R, normal",
+        "End of Material init: photograph, R, normal, PBR, base colour, roughness, metallic",
+        "End of Joint: photograph, R, normal, PBR, base colour, roughness, metallic",
+    ]
+    for name, panels in (("sdf_init", 3), ("material_init", 7), ("joint", 7)):
+        height, width, _ = read_files(run).previews[name].shape
+        assert width == panels * height * 4 / 3  # the views of make_capture have 4 : 3
 
 
 # ----------------------------------------------------------------------------------------------- unusual runs
@@ -317,3 +344,7 @@ def test_settings_are_compared_with_those_of_the_preset():
 def test_figures_are_numbers(run: Path):
     (run / "metrics.json").write_text('{"a": 1, "b": true, "c": "x", "d": [2]}')
     assert read_files(run).measured["neilfpp"].figures == {"a": 1.0}
+
+
+def test_an_unknown_figure_has_no_better_direction():
+    assert style_of("a_figure_of_another_version").better == "neither"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neilfpp_method.timing.ledger import EVERY, FIRST, Ledger, recording, timed
+from neilfpp_method.timing.ledger import FIRST_SAMPLE, SAMPLE_INTERVAL, Ledger, recording, timed
 
 
 class Clock:
@@ -46,7 +46,7 @@ def test_marks_within_a_fit_are_ignored_and_an_error_ends_it():
     clock = Clock()
 
     def fit():
-        with timed("light_fits", apart=True), timed("tracing"):
+        with timed("light_fits", undivided=True), timed("tracing"):
             clock.time += 3.0
             raise ValueError
 
@@ -86,7 +86,7 @@ def test_a_device_is_sampled_and_its_time_is_divided():
     """The work of a device is visible only while waiting for it: 3 s of rendering and 1 s of shading in every
     step, 2 s in a fit.
     """
-    clock, steps = Clock(), EVERY + FIRST + 1
+    clock, steps = Clock(), SAMPLE_INTERVAL + FIRST_SAMPLE + 1
     with recording(Ledger(synchronize=clock.synchronize, now=clock)) as ledger:
         ledger.enter("joint")
         for number in range(steps):
@@ -97,7 +97,7 @@ def test_a_device_is_sampled_and_its_time_is_divided():
                     clock.lag += 1.0
                 if number == 5:
                     clock.synchronize()
-                    with timed("light_fits", apart=True):
+                    with timed("light_fits", undivided=True):
                         clock.lag += 2.0
         clock.synchronize()
     seconds = ledger.seconds()["joint"]

@@ -57,5 +57,6 @@ def test_training_with_a_busy_port_is_an_error_of_one_line(tmp_path, capture, ca
         assert main([*words, "--view", "--view-port", str(port)]) == 2
     said = capsys.readouterr()
     assert said.err.startswith(f"error: port {port} of 127.0.0.1:")
+    assert "choose another with --view-port" in said.err
     assert said.err.count("\n") == 1
     assert not (tmp_path / "run").exists()

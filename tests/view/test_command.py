@@ -98,6 +98,7 @@ def test_a_busy_port_is_one_line(capsys, found, port):
     [
         (["--port", "70000"], "--port 70000: no such port"),
         (["--host", "no.such.host.invalid"], "no such address"),
+        (["--host", "two..dots"], "--host two..dots: no such address"),
         (["--env", "missing.exr"], "missing.exr"),
     ],
 )

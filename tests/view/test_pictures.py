@@ -9,8 +9,10 @@ import trimesh
 
 from neilfpp_method.data import memory
 from neilfpp_method.data.views import camera_rays
+from neilfpp_method.evaluate.pictures import lat_long_directions
 from neilfpp_method.relight.cameras import turntable
 from neilfpp_method.relight.film import Budget, render_picture
+from neilfpp_method.relight.lamplight import Lamplight
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.incident_map import light_at, light_picture, point_under
@@ -171,6 +173,30 @@ def test_even_light_arrives_evenly_and_not_from_below(subject, camera):
     picture = light_picture(np.ones_like(radiance), normal)
     assert (picture[cosine < -0.05] == 44).all()
     assert picture[cosine > 0.05].min() > 88
+
+
+def test_a_lamp_of_changed_light_is_seen_in_front_of_the_sky(subject, camera):
+    rays, _, ray = cast(subject, camera)
+    middle = ray[len(ray) // 2]
+    point = point_under(
+        subject, tuple(rays.origins[middle].tolist()), tuple(rays.directions[middle].tolist())
+    )
+    radius, distance = 0.1, 0.5
+    lamp = Lamplight(
+        position=(point.position + distance * point.normal)[None],
+        axis=torch.zeros(1, 3),
+        radiance=torch.tensor([[5.0, 4.0, 3.0]]),
+        radius=radius,
+    )
+    sky = Sky(torch.full((8, 16, 3), 0.7), True, 0.0)
+    radiance = light_at(subject, Lighting(sky, lamp, own=False), point)
+    cosine = lat_long_directions(len(radiance)) @ point.normal.numpy()
+    edge = (1 - (radius / distance) ** 2) ** 0.5
+    towards_lamp = radiance[cosine > edge + 5e-3]
+    assert len(towards_lamp) > 5
+    np.testing.assert_allclose(towards_lamp - 0.7, np.broadcast_to([5, 4, 3], towards_lamp.shape), rtol=1e-4)
+    around = radiance[(cosine > 0.5) & (cosine < edge - 5e-3)]
+    assert np.median(np.abs(around - 0.7)) < 1e-5
 
 
 def test_the_own_light_agrees_with_the_model(subject, camera):

@@ -24,16 +24,11 @@ from jaxtyping import Bool, Float
 
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published.protocol import (
-    Protocol,
-    decibels,
-    missing,
-    no_surface,
-    require_material,
-)
+from neilfpp_method.evaluate.metrics import decibels
+from neilfpp_method.evaluate.published.protocol import Protocol, missing, no_surface
 from neilfpp_method.evaluate.views import RenderedView, known_test_views
 from neilfpp_method.shading.color import tone_map
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["NEILF_SYNTHETIC", "aces", "frame_psnr", "median_gamma"]
 
@@ -72,7 +67,7 @@ def median_gamma(estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "P
 
 
 def _check(run: Run) -> None:
-    require_material(run)
+    check_material(run)
     truth = Truth(run.capture)
     for view in run.capture.test_views:
         if truth.material(view) is None:

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.views import View
@@ -16,12 +14,7 @@ from neilfpp_method.evaluate.size import measured_views
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.train.run import Run
 
-__all__ = ["Protocol", "decibels", "missing", "no_surface", "require_material", "write_figures"]
-
-PERFECT = 1e-10
-"""Lower bound of the mean squared error. A perfect estimate has 100 dB here; it has infinity, which JSON
-cannot hold, in the official code.
-"""
+__all__ = ["Protocol", "missing", "no_surface", "write_figures"]
 
 
 @dataclass(frozen=True)
@@ -48,11 +41,6 @@ class Protocol:
     side: int | None = None
 
 
-def decibels(squared_error: float) -> float:
-    """PSNR of a mean squared error for a peak of 1; at most 100 dB."""
-    return float(-10.0 * np.log10(max(squared_error, PERFECT)))
-
-
 def missing(protocol: str, capture: Capture, view: View, what: str, place: str) -> UserError:
     """The error for a test view that lacks a file which the protocol needs.
 
@@ -67,12 +55,6 @@ def missing(protocol: str, capture: Capture, view: View, what: str, place: str) 
         f"{capture.root}: the protocol {protocol} needs {what} of every test view; view {view.name} has none",
         f"put it at {place}",
     )
-
-
-def require_material(run: Run) -> None:
-    """Raise a `UserError` if no stage of the run has estimated the material yet."""
-    if not run.has_material:
-        raise UserError(f"{run.path}: the run has no material at step {run.step}", "train the next stage")
 
 
 def no_surface(run: Run) -> UserError:

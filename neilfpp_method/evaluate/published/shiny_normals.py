@@ -13,6 +13,7 @@ Details of the protocol:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -48,10 +49,16 @@ def _unit(normal: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
     return normal / np.sqrt(np.maximum(squared, 2.0**-23))
 
 
-def _true_normal(
-    capture: Capture, view: View
-) -> tuple[Float[np.ndarray, "H W 3"], Float[np.ndarray, "H W"]] | None:
-    """The true normals of a view and the alpha of its image; None if there are no true normals."""
+@dataclass(frozen=True)
+class _True:
+    """True normals of a view, world or scene frame, whose axes are the same; and the alpha of its image."""
+
+    normal: Float[np.ndarray, "H W 3"]
+    alpha: Float[np.ndarray, "H W"]
+
+
+def _true(capture: Capture, view: View) -> _True | None:
+    """The truth of a view; None if there are no true normals."""
     width, height = view.camera.width, view.camera.height
     path = view.image.with_name(f"{view.image.stem}_normal.png")
     if inside(capture.root, path).is_file():
@@ -65,17 +72,17 @@ def _true_normal(
                 f"{path}: has shape {pixels.shape}, but the view needs {(height, width, 3)}",
                 "render it again",
             )
-        return 2 * pixels - 1, np.ones((height, width)) if alpha is None else alpha
+        return _True(2 * pixels - 1, np.ones((height, width)) if alpha is None else alpha)
     truth = Truth(capture)
     normal, mask = truth.normal(view), truth.mask(view)
     if normal is None or mask is None:
         return None
-    return normal.view(height, width, 3).numpy(), mask.view(height, width).numpy().astype(np.float64)
+    return _True(normal.view(height, width, 3).numpy(), mask.view(height, width).numpy().astype(np.float64))
 
 
 def _check(run: Run) -> None:
     for view in run.capture.test_views:
-        if _true_normal(run.capture, view) is None:
+        if _true(run.capture, view) is None:
             beside = view.image.with_name(f"{view.image.stem}_normal.png").relative_to(run.capture.root)
             neilf = f"inputs/normal_maps/{view.name}.exr and inputs/depth_maps/{view.name}.exr"
             place = f"{beside}, or in the NeILF layout at {neilf}"
@@ -85,9 +92,9 @@ def _check(run: Run) -> None:
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     angles = []
     for view, estimate in zip(run.capture.test_views, rendered, strict=True):
-        normal, alpha = _true_normal(run.capture, view)
-        weight = estimate.maps["opacity"][..., 0] * alpha
-        angles.append(weighted_angle(estimate.maps["normal"], normal, weight))
+        true = _true(run.capture, view)
+        weight = estimate.maps["opacity"][..., 0] * true.alpha
+        angles.append(weighted_angle(estimate.maps["normal"], true.normal, weight))
     angles = [angle for angle in angles if not np.isnan(angle)]
     if not angles:
         raise no_surface(run)

@@ -27,6 +27,7 @@ Details of the protocol:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -39,13 +40,13 @@ from neilfpp_method.data.images import read_image
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.views import View, camera_rays
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.metrics import align_scale
-from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
+from neilfpp_method.evaluate.metrics import align_scale, decibels
+from neilfpp_method.evaluate.published.protocol import Protocol, missing
 from neilfpp_method.evaluate.published.similarity import ssim_map
 from neilfpp_method.evaluate.published.truth_files import existing, read_array
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["STANFORD_ORB", "albedo_scores", "eroded", "image_scores", "normal_distance"]
 
@@ -151,7 +152,7 @@ def _picture(path: Path, view: View) -> Float[np.ndarray, "H W C"]:
 
 
 def _check(run: Run) -> None:
-    require_material(run)
+    check_material(run)
     if not run.capture.hdr:
         raise UserError(f"the protocol {NAME} is for linear images", "train on a folder of blender_HDR")
     for view in run.capture.test_views:
@@ -170,10 +171,19 @@ def _check(run: Run) -> None:
 # ---------------------------------------------------------------------------------------------------- figures
 
 
+@dataclass(frozen=True)
+class _Depths:
+    """Depth of a view along the axis of its camera: estimate, scene units, truth, and the eroded mask."""
+
+    estimate: Float[np.ndarray, "H W"]
+    truth: Float[np.ndarray, "H W"]
+    mask: Mask
+
+
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     capture = run.capture
     scores: dict[str, list[float]] = {}
-    depths: list[tuple[Mask, Mask, Mask]] = []
+    depths: list[_Depths] = []
     for view, estimate in zip(capture.test_views, rendered, strict=True):
         mask = (_picture(_mask_file(view), view)[..., 0] > 0.5).astype(np.float32)
         if not eroded(mask).any():
@@ -190,33 +200,40 @@ def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
             figures["normal_distance"] = normal_distance(normal, _quarter(read_array(path, (*full, 3))), mask)
         if path := _ground_truth(capture, "z_depth", f"{view.image.stem}.npy"):
             depth = _along_axis(capture, view, estimate)
-            depths.append((depth, _quarter(read_array(path, full)), eroded(mask)))
+            depths.append(_Depths(depth, _quarter(read_array(path, full)), eroded(mask)))
         for name, value in figures.items():
             scores.setdefault(name, []).append(value)
     means = {name: float(np.mean(values)) for name, values in scores.items()}
-    return means | ({"depth_mse": scene_depth_error(depths)} if depths else {})
+    return means | ({"depth_mse": _depth_error(depths)} if depths else {})
 
 
-def _along_axis(capture: Capture, view: View, rendered: RenderedView) -> Mask:
+def _along_axis(capture: Capture, view: View, rendered: RenderedView) -> Float[np.ndarray, "H W"]:
     """Depth along the axis of the camera, scene units, from the depth along the rays."""
     camera = capture.scene_camera(view)
     cosine = camera_rays(camera).directions.double().numpy() @ camera.w2c[2, :3]
     return rendered.maps["depth"][..., 0] * cosine.reshape(SIDE, SIDE).astype(np.float32)
 
 
-def scene_depth_error(depths: Sequence[tuple[Mask, Mask, Mask]]) -> float:
+def _depth_error(depths: Sequence[_Depths]) -> float:
     """Mean over views of the squared error of depth, averaged over the frame of each.
 
     An estimate that is 0 in the whole mask of a view is replaced by 1, as in the official code.
-
-    Args:
-        depths: estimate, truth and eroded mask of each view.
     """
-    filled = [(np.ones_like(e) if np.square(e[m > 0.5]).sum() <= EPSILON else e, t, m) for e, t, m in depths]
-    product = sum(float((t * e)[m > 0.5].sum(dtype=np.float64)) for e, t, m in filled)
-    energy = sum(float(np.square(e)[m > 0.5].sum(dtype=np.float64)) for e, _, m in filled)
+    filled = [
+        replace(view, estimate=np.ones_like(view.estimate))
+        if np.square(view.estimate[view.mask > 0.5]).sum() <= EPSILON
+        else view
+        for view in depths
+    ]
+    product = sum(_sum_in_mask(view.truth * view.estimate, view.mask) for view in filled)
+    energy = sum(_sum_in_mask(np.square(view.estimate), view.mask) for view in filled)
     factor = product / energy
-    return float(np.mean([(np.square(factor * e - t) * m).mean(dtype=np.float64) for e, t, m in filled]))
+    errors = (np.square(factor * view.estimate - view.truth) * view.mask for view in filled)
+    return float(np.mean([error.mean(dtype=np.float64) for error in errors]))
+
+
+def _sum_in_mask(values: Float[np.ndarray, "H W"], mask: Mask) -> float:
+    return float(values[mask > 0.5].sum(dtype=np.float64))
 
 
 STANFORD_ORB = Protocol(

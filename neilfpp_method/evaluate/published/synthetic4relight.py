@@ -34,13 +34,14 @@ from jaxtyping import Float
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
+from neilfpp_method.evaluate.metrics import decibels
+from neilfpp_method.evaluate.published.protocol import Protocol, missing
 from neilfpp_method.evaluate.published.similarity import ssim_map
 from neilfpp_method.evaluate.published.tensoir import albedo_factor
 from neilfpp_method.evaluate.published.truth_files import alpha_of, check_full_size, existing, read_beside
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.shading.color import srgb_to_linear
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["SYNTHETIC4RELIGHT"]
 
@@ -85,7 +86,7 @@ def _true(capture: Capture, view: View) -> _True:
 
 
 def _check(run: Run) -> None:
-    require_material(run)
+    check_material(run)
     root = run.capture.root
     for view in run.capture.test_views:
         check_full_size(NAME, view)

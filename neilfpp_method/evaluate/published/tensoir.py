@@ -34,12 +34,13 @@ from jaxtyping import Bool, Float
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
-from neilfpp_method.evaluate.published.protocol import Protocol, decibels, missing, require_material
+from neilfpp_method.evaluate.metrics import decibels
+from neilfpp_method.evaluate.published.protocol import Protocol, missing
 from neilfpp_method.evaluate.published.similarity import ssim_map
 from neilfpp_method.evaluate.published.truth_files import alpha_of, check_full_size, existing, read_beside
 from neilfpp_method.evaluate.views import RenderedView
 from neilfpp_method.shading.color import tone_map
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["TENSOIR", "albedo_factor", "over_white"]
 
@@ -100,7 +101,7 @@ def _true(capture: Capture, view: View) -> _True:
 
 
 def _check(run: Run) -> None:
-    require_material(run)
+    check_material(run)
     if run.capture.hdr:
         raise UserError(
             f"the protocol {NAME} is for display values, and the images are linear", "use --protocol neilfpp"

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.export.asset.surface import AssetSurface, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, first_hits, hits_along_normals
 from neilfpp_method.export.asset.tangents import vertex_tangents
 from neilfpp_method.export.asset.texels import covered_texels, dilate
 from neilfpp_method.export.mesh import materials_in_parts
@@ -95,7 +95,7 @@ def bake(
         tangent = texels.interpolate(tangents[:, :3], mesh.faces)
         sign = tangents[mesh.faces[texels.face, 0], 3:]
         unit_normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True).clip(1e-12)
-        hits = meet_along(detail.surface, tracer, position, unit_normal, detail.reach)
+        hits = hits_along_normals(detail.surface, tracer, position, unit_normal, detail.reach)
         points = torch.as_tensor(hits.position, dtype=torch.float32, device=run.device)
         material = materials_in_parts(run, points)
         values = [
@@ -107,8 +107,7 @@ def bake(
         ]
         texture[texels.number] = np.rint(255 * np.concatenate(values, axis=1).clip(0, 1)).astype(np.uint8)
         covered[texels.number] = True
-        on_progress((texels.number[-1] + 1) / size**2 if len(texels.number) else 0.0)
-    on_progress(1.0)
+        on_progress(texels.done)
     dilated = dilate(texture.reshape(size, size, -1), covered.reshape(size, size))
     return Textures(
         **{name: dilated[..., channels] for name, channels in CHANNELS.items()},

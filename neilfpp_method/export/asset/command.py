@@ -24,7 +24,7 @@ from neilfpp_method.export.asset.usd import has_usd
 from neilfpp_method.export.asset.visible import visible_faces
 from neilfpp_method.export.mesh import has_surface
 from neilfpp_method.structures import OrientedPoints
-from neilfpp_method.train.run import Run
+from neilfpp_method.train.run import Run, check_material
 
 __all__ = ["AssetOptions", "Bar", "Deviations", "check_asset", "export_asset"]
 
@@ -70,8 +70,7 @@ def check_asset(run: Run, options: AssetOptions) -> None:
         raise UserError(
             f"{run.path}: the host of this run has no surface to export", "export from a run of another host"
         )
-    if not run.has_material:
-        raise UserError(f"{run.path}: there is no material yet at step {run.step}", "train the next stage")
+    check_material(run)
     if not MIN_TEXTURE <= options.texture_size <= MAX_TEXTURE:
         raise UserError(
             f"a texture cannot have {options.texture_size} texels per side",

@@ -53,7 +53,7 @@ def write_asset(run: Run, mesh: Unwrapped, textures: Textures, out: Path) -> Non
             write_png(folder / "textures" / f"{name}.png", picture)
         (folder / "asset.glb").write_bytes(glb_bytes(mesh, textures, scene["lamps"]))
         if has_usd():
-            (folder / "asset.usda").write_text(usd_text(mesh, scene["lamps"]))
+            (folder / "asset.usda").write_text(usd_text(mesh, scene["lamps"]), "utf-8")
         # Texture coordinates u and v, v upwards, for programs that do not read glTF.
         rows = np.concatenate((mesh.normals, mesh.uv), axis=1).astype(np.float32)
         columns = dict(zip((*NORMAL, "u", "v"), rows.T, strict=True))

@@ -8,7 +8,7 @@ import fast_simplification
 import numpy as np
 import trimesh
 
-from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, hits_along_normals
 
 __all__ = ["Distance", "Simplified", "distance_between", "simplified"]
 
@@ -47,15 +47,15 @@ class Simplified:
     distance: Distance
 
 
-def simplified(fine: AssetSurface, most_faces: int, error: float) -> Simplified:
-    """Reduce the number of triangles to `most_faces`, then halve it while the distance stays within `error`.
+def simplified(fine: AssetSurface, max_faces: int, error: float) -> Simplified:
+    """Reduce the number of triangles to `max_faces`, then halve it while the distance stays within `error`.
 
     Args:
         fine: the surface.
-        most_faces: largest number of triangles, whatever the distance.
+        max_faces: largest number of triangles, whatever the distance.
         error: largest distance that a further reduction may cause, scene units.
     """
-    count = min(most_faces, len(fine.faces))
+    count = min(max_faces, len(fine.faces))
     best = _with_faces(fine, count)
     while count // 2 >= MIN_FACES:
         count //= 2
@@ -70,7 +70,7 @@ def distance_between(fine: AssetSurface, coarse: AssetSurface) -> Distance:
     """Measure the distance along the normals of the fine surface, at points spread uniformly over it."""
     points, face = trimesh.sample.sample_surface(fine.mesh(), SAMPLES, seed=0)
     normals = fine.mesh().face_normals[face]
-    hits = meet_along(coarse, first_hits(coarse), np.asarray(points), normals, REACH)
+    hits = hits_along_normals(coarse, first_hits(coarse), np.asarray(points), normals, REACH)
     distances = hits.distance[hits.valid]
     near = float(np.percentile(distances, PERCENTILE)) if len(distances) else REACH
     return Distance(near, 1 - len(distances) / SAMPLES)

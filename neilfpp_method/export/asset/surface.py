@@ -13,13 +13,13 @@ from torch import Tensor
 
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.export.mesh import surface_mesh
-from neilfpp_method.export.surface_cache import extracted_surface, shading_normals
+from neilfpp_method.export.surface_cache import shaded_surface, shading_normals
 from neilfpp_method.hosts.mesh import MeshHost, corner_normals
-from neilfpp_method.hosts.mesh_tracing import FirstHits, build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import FirstHits, face_normals, first_hits_of, intersect_planes
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.train.run import Run
 
-__all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "meet_along"]
+__all__ = ["AssetSurface", "NormalHits", "creased", "fine_surface", "first_hits", "hits_along_normals"]
 
 STEP_BACK = 1e-4
 """Distance that a ray starts behind its point, scene units, so that it hits a surface through the point."""
@@ -52,7 +52,7 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
 
     Args:
         run: a run with a mesh or a distance field.
-        resolution: resolution of `extracted_surface` for a distance field.
+        resolution: resolution of `shaded_surface` for a distance field.
         say: receives a message if a file in the run folder is replaced.
 
     Raises:
@@ -64,8 +64,7 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
         normals = shading_normals(host, position, normal).double().cpu().numpy().reshape(-1, 3, 3)
         return AssetSurface(np.array(mesh.vertices, np.float64), np.array(mesh.faces), normals)
-    surface = extracted_surface(run, resolution, shaded=True, say=say)
-    assert surface.normals is not None
+    surface = shaded_surface(run, resolution, say)
     faces = surface.faces.astype(np.int64)
     return AssetSurface(surface.vertices.astype(np.float64), faces, surface.normals.astype(np.float64)[faces])
 
@@ -73,17 +72,13 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
 def creased(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> AssetSurface:
     """Build a surface with normals from its triangles: smooth, except at creases (`corner_normals`)."""
     mesh = Mesh(torch.from_numpy(vertices).float(), torch.from_numpy(faces).long())
-    triangles = mesh.vertices[mesh.faces]
-    across = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return AssetSurface(
-        vertices, faces, corner_normals(mesh, safe_normalize(across, eps=1e-18)).double().numpy()
-    )
+    normals = corner_normals(mesh, face_normals(mesh.vertices[mesh.faces]))
+    return AssetSurface(vertices, faces, normals.double().numpy())
 
 
 def first_hits(surface: AssetSurface) -> FirstHits:
-    """Build a function that returns the first triangle hit by each ray; uses Embree if it is installed."""
-    triangles = surface.triangles()
-    return embree_tracer(triangles) or tree_tracer(build_tree(triangles))
+    """Make a function that returns the first triangle hit by each ray."""
+    return first_hits_of(surface.triangles())
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,7 @@ class NormalHits:
     normal: Float[np.ndarray, "N 3"]
 
 
-def meet_along(
+def hits_along_normals(
     surface: AssetSurface,
     tracer: FirstHits,
     position: Float[np.ndarray, "N 3"],
@@ -132,7 +127,7 @@ def meet_along(
         rows = torch.nonzero(face >= 0)[:, 0]
         if not len(rows):
             continue
-        hit = meet(start[rows], direction[rows], triangles[face[rows]])
+        hit = intersect_planes(start[rows], direction[rows], triangles[face[rows]])
         shaded = safe_normalize((hit.weights.clamp(0, 1)[..., None] * corners[face[rows]]).sum(1))
         distance = (hit.distance - STEP_BACK).abs()
         nearer = (distance < nearest[rows]) & ((shaded * along[rows]).sum(-1) > 0)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.ndimage import distance_transform_edt
 
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.hosts.mesh_tracing import build_tree, embree_tracer, meet, tree_tracer
+from neilfpp_method.hosts.mesh_tracing import first_hits_of, intersect_planes
 
 __all__ = ["Texels", "covered_texels", "dilate"]
 
@@ -27,11 +27,13 @@ class Texels:
         number: row-major index of the texel, from the top.
         face: index of the triangle.
         weights: barycentric coordinates of the texel's centre.
+        done: share of the texture up to the end of this batch, in (0, 1].
     """
 
     number: Int[np.ndarray, " T"]
     face: Int[np.ndarray, " T"]
     weights: Float[np.ndarray, "T 3"]
+    done: float
 
     def interpolate(
         self, values: Float[np.ndarray, "V C"], faces: Int[np.ndarray, "F 3"]
@@ -46,7 +48,7 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
     The triangles in texture space form a flat surface at z = 0, and one ray per texel is traced onto it.
     """
     flat = torch.from_numpy(np.pad(mesh.uv, ((0, 0), (0, 1)))).float()[torch.from_numpy(mesh.faces)]
-    tracer = embree_tracer(flat) or tree_tracer(build_tree(flat))
+    tracer = first_hits_of(flat)
     down = torch.tensor([0.0, 0.0, -1.0])
     for number in torch.arange(size * size).split(TEXELS_AT_ONCE):
         u, v = (number % size + 0.5) / size, 1 - (number // size + 0.5) / size
@@ -54,9 +56,10 @@ def covered_texels(mesh: Unwrapped, size: int) -> Iterator[Texels]:
         face = tracer(origins, down.expand_as(origins))
         rows = torch.nonzero(face >= 0)[:, 0]
         face, origins = face[rows], origins[rows]
-        weights = meet(origins, down.expand_as(origins), flat[face]).weights.clamp(0, 1).double()
+        weights = intersect_planes(origins, down.expand_as(origins), flat[face]).weights.clamp(0, 1).double()
         weights = weights / weights.sum(-1, keepdim=True)
-        yield Texels(number[rows].numpy(), face.numpy(), weights.numpy())
+        done = (int(number[-1]) + 1) / size**2
+        yield Texels(number[rows].numpy(), face.numpy(), weights.numpy(), done)
 
 
 def dilate(

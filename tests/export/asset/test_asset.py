@@ -20,9 +20,11 @@ from scipy.ndimage import map_coordinates
 from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset import files as files_module
+from neilfpp_method.export.asset import texels
 from neilfpp_method.export.asset.atlas import Unwrapped
-from neilfpp_method.export.asset.bake import Textures
+from neilfpp_method.export.asset.bake import Detail, Textures, bake
 from neilfpp_method.export.asset.glb import WORLD_TO_GLTF, glb_bytes
+from neilfpp_method.export.asset.surface import creased
 from neilfpp_method.export.asset.usd import has_usd, usd_text
 from tests.data.make_capture import CENTER, SCALE, srgb
 from tests.export.asset.balls import (
@@ -192,6 +194,16 @@ def test_the_normal_map_gives_the_normals_of_the_fine_surface(tmp_path):
 
     assert off(bumped) < 0.6
     assert off(bumped) < 0.25 * off(n)
+
+
+def test_the_progress_of_baking_never_goes_back(tmp_path, monkeypatch):
+    monkeypatch.setattr(texels, "TEXELS_AT_ONCE", 64)
+    corners, faces = np.array([[-0.2, 0.0, 0.8], [0.2, 0.0, 0.8], [0.0, 0.2, 0.8]]), np.array([[0, 1, 2]])
+    uv = np.array([[0.0, 0.8], [1.0, 0.8], [1.0, 1.0]])  # only the first of four batches has texels
+    mesh = Unwrapped(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), uv, faces, charts=1, gap=2.0)
+    done: list[float] = []
+    bake(ball_run(tmp_path), mesh, Detail(creased(corners, faces), 0.01), 16, on_progress=done.append)
+    assert done == [0.25, 0.5, 0.75, 1.0]
 
 
 def test_lamps_keep_their_positions(asset):

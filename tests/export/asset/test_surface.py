@@ -12,7 +12,7 @@ from neilfpp_method.data.views import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_visible, remove_small_components
 from neilfpp_method.export.asset.simplify import distance_between, simplified
-from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, meet_along
+from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, hits_along_normals
 from neilfpp_method.export.asset.visible import visible_faces
 
 
@@ -97,7 +97,7 @@ def test_small_holes_are_closed_and_large_ones_kept():
     np.testing.assert_allclose(mesh.face_normals[-len(added) :, 2], 1, atol=0.02)
     tracer = first_hits(closed)
     for height, met in ((1.0, True), (-1.0, False)):
-        found = meet_along(
+        found = hits_along_normals(
             closed, tracer, np.array([[0.004, 0.003, height]]), np.array([[0.0, 0.0, np.sign(height)]]), 0.7
         )
         assert found.valid[0] == met
@@ -117,14 +117,14 @@ def test_points_are_moved_to_the_surface_of_the_same_orientation():
     plates = trimesh.util.concatenate([trimesh.creation.box((1, 1, 0.02)) for _ in range(2)])
     plates.vertices[8:, 2] += 0.1
     shape = surface(plates)
-    found = meet_along(
+    found = hits_along_normals(
         shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.2
     )
     assert found.valid.all()
     np.testing.assert_allclose(found.position, [[0.1, 0.2, 0.01]], atol=1e-6)
     np.testing.assert_allclose(found.distance, 0.02, atol=1e-6)
     np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-6)
-    short = meet_along(
+    short = hits_along_normals(
         shape, first_hits(shape), np.array([[0.1, 0.2, 0.03]]), np.array([[0.0, 0.0, 1.0]]), 0.015
     )
     assert not short.valid.any()

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from PIL import Image
 
-__all__ = ["data_url", "encoded"]
+__all__ = ["data_url", "image_url"]
 
 QUALITY = 88
 """Quality of WebP, out of 100. At this value smooth maps show no visible steps."""
 
 
-def encoded(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None) -> str:
+def image_url(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"] | None = None) -> str:
     """Encode an image as a data URL; pixels outside of the mask are transparent, for light and dark pages."""
     if mask is not None and not mask.all():
         alpha = np.where(mask, 255, 0).astype(np.uint8)[..., None]

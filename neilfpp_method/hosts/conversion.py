@@ -4,7 +4,7 @@
 |---------------------------|--------------------------------------------------------------|
 | `SurfaceHits`             | none                                                         |
 | dictionary                | by the host's `read_outputs`, else by the names below        |
-| named tuple               | as a dictionary, if it has a color and a normal by name      |
+| named tuple               | as a dictionary, if it has a colour and a normal by name     |
 | (color, position, normal) | as the result of a function: a ray with a zero normal misses |
 
 | field         | names in a dictionary                                                             |
@@ -66,24 +66,25 @@ def as_hits(host: object, rays: RayBatch, rendered: Any) -> SurfaceHits:
     return hits
 
 
-def function_hits(name: str, rays: RayBatch, answer: Any) -> SurfaceHits:
+def function_hits(name: str, rays: RayBatch, returned: Any) -> SurfaceHits:
     """Convert (color, position, normal), each (N, 3), to hits.
 
     Args:
         name: name of the function, for error messages.
         rays: the rays that it was called with.
-        answer: what it returned.
+        returned: what it returned.
 
     Raises:
         UserError: these are not three tensors of the right shape on the device of the rays.
     """
-    if not isinstance(answer, tuple | list) or len(answer) != 3:
-        kind = f"{len(answer)} values" if isinstance(answer, tuple | list) else f"a {type(answer).__name__}"
+    if not isinstance(returned, tuple | list) or len(returned) != 3:
+        is_list = isinstance(returned, tuple | list)
+        kind = f"{len(returned)} values" if is_list else f"a {type(returned).__name__}"
         raise UserError(
             f"{name}: returns {kind}", "return color, position and normal, each (N, 3), or a dictionary"
         )
-    check_tensors(name, rays, dict(zip(("color", "position", "normal"), answer, strict=True)))
-    color, position, normal = answer
+    check_tensors(name, rays, dict(zip(("color", "position", "normal"), returned, strict=True)))
+    color, position, normal = returned
     # The comparison is False for NaN.
     hit = normal.detach().square().sum(-1) > 0.25
     position = torch.where(hit[:, None], position, rays.origins.to(position.dtype))

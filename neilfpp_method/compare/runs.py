@@ -8,18 +8,18 @@ from pathlib import Path
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.errors import UserError
-from neilfpp_method.report.files import Files, read_files
+from neilfpp_method.report.files import RunFiles, read_files
 from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from neilfpp_method.train.run import CaptureSource, read_description
 
-__all__ = ["Contender", "labels_of", "read_contenders"]
+__all__ = ["ComparedRun", "labels_of", "read_compared_runs"]
 
 MAX_RUNS = 16
 """Largest number of runs. A table or image with more columns would not fit on a screen."""
 
 
 @dataclass(frozen=True)
-class Contender:
+class ComparedRun:
     """A run of the comparison.
 
     Attributes:
@@ -33,7 +33,7 @@ class Contender:
 
     label: str
     path: Path
-    files: Files
+    files: RunFiles
     source: CaptureSource
     capture: Capture
     step: int
@@ -44,7 +44,7 @@ class Contender:
         return self.step > 0
 
 
-def read_contenders(paths: Sequence[Path]) -> list[Contender]:
+def read_compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     """Read the runs, in the order given.
 
     Raises:
@@ -60,7 +60,7 @@ def read_contenders(paths: Sequence[Path]) -> list[Contender]:
     # All folders are read before any capture is loaded, so that a folder that is not a run fails early.
     contents = [(path, read_files(path), read_description(path).source) for path in paths]
     return [
-        Contender(label, path, files, source, source.load_again(path), _last_step(path))
+        ComparedRun(label, path, files, source, source.load_again(path), _last_step(path))
         for label, (path, files, source) in zip(labels_of(resolved), contents, strict=True)
     ]
 
