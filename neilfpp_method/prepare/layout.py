@@ -213,6 +213,7 @@ def _relocate(view: View, old: Path, new: Path) -> View:
 
 def _test_views(posed: Posed, views: tuple[View, ...], test_every: int | None) -> frozenset[str]:
     if test_every is None and posed.test is not None:
-        return posed.test
+        # A test view of the capture may have been left out.
+        return posed.test & {view.name for view in views}
     every = TEST_EVERY if test_every is None else test_every
     return frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()

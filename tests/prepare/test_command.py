@@ -253,6 +253,16 @@ def test_a_capture_with_poses_keeps_them(tmp_path):
         assert (read_image(view.image).pixels == read_image(old.image).pixels).all()
 
 
+def test_a_test_view_that_auto_leaves_out_is_no_test_view_of_the_capture(tmp_path):
+    source = load_capture(make_capture(tmp_path / "sphere", masks=True))
+    black = source.test_views[0]
+    write_exr(black.image, {"RGB": np.zeros_like(read_image(black.image).pixels)})
+    assert prepare(tmp_path / "sphere", tmp_path / "out", "--auto") == 0
+    capture = load_capture(tmp_path / "out")
+    assert {view.name for view in capture.views} == {view.name for view in source.views} - {black.name}
+    assert capture.test == source.test - {black.name}
+
+
 def test_a_colmap_project_keeps_its_poses_and_points(prepared, tmp_path):
     project = tmp_path / "project"
     shutil.copytree(prepared / "work" / "model" / "largest", project / "sparse" / "0")
