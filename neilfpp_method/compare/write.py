@@ -21,7 +21,8 @@ from neilfpp_method.compare.contenders import Contender, read_contenders
 from neilfpp_method.compare.figures import SHOWN, figure_rows, figures_parts
 from neilfpp_method.compare.parts import Part, runs_part, seconds_part, settings_part
 from neilfpp_method.compare.sheet import Column, comparison_sheet
-from neilfpp_method.data.images import replacing, write_png
+from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.images import write_png
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.views import ComparedViews, compare_views

@@ -26,8 +26,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Shaped, UInt8
 
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.drawing import BLOCK, KNOWN, MASK, NEAR, VALID, near_object
-from neilfpp_method.data.images import replacing
 from neilfpp_method.data.pixel_encoding import BYTES, ENCODINGS, Encoding, encodings_for
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.view_pixels import read_view

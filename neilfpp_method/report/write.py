@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.images import read_image, replacing
+from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.report import pictures, tables
 from neilfpp_method.report.encoded import encoded
