@@ -20,6 +20,7 @@ from neilfpp_method.data.bracket_folder import Brackets
 from neilfpp_method.data.capture import READERS, Capture, load_capture
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
+from neilfpp_method.data.split import check_test_every
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.prepare.background import sigterm_as_ctrl_c, silent
 from neilfpp_method.prepare.layout import WORK, PoseSource, lay_out
@@ -51,6 +52,7 @@ def run_prepare(options: Prepare, console: Console) -> Path:
         UserError: the input is bad, or the images cannot be placed in one scene.
         Stopped: the command was interrupted; the message names the command that continues.
     """
+    check_test_every(options.test_every)
     _check_place(options)
     silent()
     with _stop_with_command(options):
@@ -96,11 +98,6 @@ def _check_place(options: Prepare) -> None:
     if out.is_dir() and any(out.iterdir()) and not (out / WORK).is_dir():
         raise UserError(
             f"{options.out}: not empty, and not written by neilfpp prepare", "choose another --out"
-        )
-    if options.test_every is not None and (options.test_every < 0 or options.test_every == 1):
-        raise UserError(
-            f"every {options.test_every}-th view cannot be held out",
-            "give 2 or more, or 0 to hold out no view",
         )
 
 

@@ -18,6 +18,7 @@ from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
 from neilfpp_method.data.scene_box import SceneBox, find_box
+from neilfpp_method.data.split import every_kth
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.defects import inspect_capture, problems, views_to_leave_out
@@ -40,9 +41,6 @@ CLOUD = "points.ply"
 
 IMAGE_FOLDERS = ("images", "masks", "valid")
 """Folders of a capture that this module writes, and empties first."""
-
-TEST_EVERY = 8
-"""Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
 
 WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
 """Writers of other layouts, by the value of `--also`."""
@@ -215,5 +213,4 @@ def _test_views(posed: Posed, views: tuple[View, ...], test_every: int | None) -
     if test_every is None and posed.test is not None:
         # A test view of the capture may have been left out.
         return posed.test & {view.name for view in views}
-    every = TEST_EVERY if test_every is None else test_every
-    return frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()
+    return every_kth(views, test_every)

@@ -185,9 +185,9 @@ def test_split_file_is_broken(tmp_path: Path, text: str) -> None:
     refused(root, "split.json")
 
 
-def test_no_training_view_is_left(tmp_path: Path) -> None:
+def test_an_impossible_split_is_refused(tmp_path: Path) -> None:
     root = make_capture(tmp_path)
-    refused(root, "all 6 views are held out", test_every=1)
+    refused(root, "every 1-th view cannot be held out", test_every=1)
     refused(root, "cannot be held out", test_every=-2)
     refused(root, "there is no view 'seven'", test=["seven"])
 
