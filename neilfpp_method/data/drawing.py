@@ -115,8 +115,7 @@ class PixelDraws:
 
 
 def near_object(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels on the object or within `NEAR_DISTANCE` of it, computed at `SMALL_SIDE` pixels a
-    side.
+    """Return the pixels on the object or within `NEAR_DISTANCE` of it, computed on a reduced mask.
 
     >>> mask = np.zeros((100, 100), bool)
     >>> mask[50, 50] = True

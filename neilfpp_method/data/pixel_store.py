@@ -2,8 +2,7 @@
 
     color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes per pixel for 8-bit images, else 6 or 12
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
-    store.json   the inputs of the store; it is written last, so a folder without it contains no complete
-    store
+    store.json   the inputs of the store; it is written last, so a folder without it is incomplete
 
 Views are read one at a time, so building a store takes the memory of one view. A store is used again if it
 was built from the same files (name, size, modification time), cameras and factors; otherwise it is built
@@ -113,8 +112,7 @@ def load_pixels(
     on_view: Callable[[str], None] | None = None,
     exact: bool = False,
 ) -> PixelStore:
-    """Load the pixels of views: from a store in `folder` if it has the same inputs, otherwise from the
-    images.
+    """Load the pixels of views: from a store with the same inputs if there is one, else from the images.
 
     Args:
         views: the views, at least one.
@@ -239,8 +237,7 @@ def _near(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, " N"]:
 
 
 def _mask_from_background(store: PixelStore) -> None:
-    """If no view has a mask, mark the pixels whose colour is exactly that of most border pixels as
-    background.
+    """Mark the pixels as background whose colour is exactly that of most border pixels.
 
     For all other pixels the mask remains unknown. Rendered captures and clipped backdrops have such pixels;
     photographs of other backdrops have few because of noise.
@@ -264,9 +261,7 @@ def _mask_from_background(store: PixelStore) -> None:
 
 
 def _median(values: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, " C"]:
-    """The lower median per channel. It is one of the values, so a colour that most pixels have is found
-    exactly.
-    """
+    """The lower median per channel: one of the values, so the colour of most pixels is found exactly."""
     return np.partition(values, (len(values) - 1) // 2, axis=0)[(len(values) - 1) // 2]
 
 
@@ -289,7 +284,7 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
 def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """Make an array of zeros in memory, or in a file.
 
-    The blocks of the file are allocated at once: writing to a memory map on a full disk would end the
+    The blocks of the file are allocated at once, because writing to a memory map on a full disk would end the
     process.
     """
     if path is None:

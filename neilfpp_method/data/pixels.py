@@ -77,7 +77,9 @@ class PixelDataset:
         exact: bool = False,
     ) -> None:
         if not views:
-            raise UserError(f"{capture.root}: no views to load", "hold out fewer views, or more")
+            raise UserError(
+                f"{capture.root}: no views to load", "leave views of both kinds, to train on and to test on"
+            )
         self.capture = capture
         self.views = tuple(views)
         self.device = torch.device(device)
@@ -243,8 +245,7 @@ class PixelDataset:
         return self._linear(np.concatenate(colors))
 
     def border_color(self) -> Float[Tensor, " 3"] | None:
-        """Return the linear RGB of the background, or None if the borders of the images have no common
-        colour.
+        """Return the linear RGB of the background; None if the image borders have no common colour.
 
         The background colour is the median of the border, if at least half of the border pixels differ from
         it by at most 2 % of the brighter of that colour and the object's median radiance, and if the other

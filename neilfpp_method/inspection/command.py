@@ -27,6 +27,7 @@ STYLES = {
     "limited": "bold yellow",
     "poor": "bold red",
 }
+"""Style of a word on the console: the severity of a defect, or the level of the radiance."""
 
 
 def run_inspection(
@@ -82,7 +83,6 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
         "broken",
         "pixels",
         "levels",
-        "object_from",
     )
     return {
         "capture": {
