@@ -42,7 +42,7 @@ def hold_back(pixels: PixelDataset, seed: int, patches: int = PATCHES) -> PixelB
         The pixels of the patches that are valid and on the object.
     """
     bits = pixels.store.bits
-    of_object = PixelSet(bits, VALID | MASK, VALID | MASK)
+    of_object = PixelSet(bits, VALID | MASK)
     count = min(patches, int(MAX_SHARE * of_object.count) // SIDE**2)
     taken: set[int] = set()
     in_view: Counter[int] = Counter()

@@ -73,7 +73,7 @@ class PixelStore:
     def __len__(self) -> int:
         return int(self.starts[-1])
 
-    def rows(self, i: int) -> slice:
+    def indices(self, i: int) -> slice:
         """Return the indices of the pixels of view `i`."""
         return slice(int(self.starts[i]), int(self.starts[i + 1]))
 
@@ -88,7 +88,7 @@ class PixelStore:
 
     def view_colors(self, i: int) -> Float32[np.ndarray, "N 3"]:
         """Return the colours of a view."""
-        return self.encoding.decode(np.asarray(self.codes[self.rows(i)]), self.scales[i])
+        return self.encoding.decode(np.asarray(self.codes[self.indices(i)]), self.scales[i])
 
     def release(self) -> None:
         """Unmap the pages of the files; later reads map them again."""
@@ -206,8 +206,8 @@ def _fill(
             encoded = encoding.encode(pixels.color)
             if encoded is None:
                 return None
-            codes[store.rows(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
-            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
+            codes[store.indices(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
+            bits[store.indices(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
             if pixels.mask is None:
                 unknown.append(i)
             store.release()
@@ -221,7 +221,7 @@ def _fill(
     else:
         # In views without a mask every pixel may be on the object, so all count as near it.
         for i in unknown:
-            bits[store.rows(i)] |= NEAR
+            bits[store.indices(i)] |= NEAR
     return store
 
 
@@ -253,10 +253,10 @@ def _mask_from_background(store: PixelStore) -> None:
         return
     for i, view in enumerate(store.views):
         background = (store.view_colors(i) == color).all(axis=-1)
-        bits = store.bits[store.rows(i)] & np.uint8(VALID)
+        bits = store.bits[store.indices(i)] & np.uint8(VALID)
         bits |= np.where(background, KNOWN, MASK).astype(np.uint8)
         shape = (view.camera.height, view.camera.width)
-        store.bits[store.rows(i)] = bits | _near(~background.reshape(shape))
+        store.bits[store.indices(i)] = bits | _near(~background.reshape(shape))
         store.release()
 
 

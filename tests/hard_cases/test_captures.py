@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from neilfpp_method.data.backdrop import border_color
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.pixels import PixelDataset
@@ -260,4 +261,4 @@ def test_images_of_one_pixel(tmp_path: Path) -> None:
     batch = pixels.sample(20)
     assert (batch.image_gradient == 0).all()
     assert batch.directions.isfinite().all()
-    assert pixels.border_color() is not None
+    assert border_color(pixels) is not None
