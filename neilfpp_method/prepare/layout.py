@@ -21,7 +21,7 @@ from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.split import every_kth
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
-from neilfpp_method.inspection.defects import inspect_capture, problems, views_to_leave_out
+from neilfpp_method.inspection.defects import MIN_COUNT, inspect_capture, problems, views_to_leave_out
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.prepare.pictures import write_picture
@@ -104,12 +104,15 @@ def lay_out(source: PoseSource, options: Prepare, open_bar: Bars) -> Summary | N
     bar = open_bar("inspecting", len(prepared.views))
     inspection = inspect_capture(prepared, lambda _: bar.advance())
     rejected = views_to_leave_out(inspection) if options.auto else {}
-    if rejected:
-        kept = tuple(view for view in prepared.views if view.name not in rejected)
+    kept = tuple(view for view in prepared.views if view.name not in rejected)
+    if len(kept) < MIN_COUNT and rejected:
+        named = ", ".join(rejected)
+        remarks = [f"no view is left out: fewer than {MIN_COUNT} would remain without {named}"]
+    else:
+        remarks = [f"left out: {name}, {reason}" for name, reason in rejected.items()]
         prepared = replace(prepared, views=kept)
-        inspection = inspect_capture(prepared)
-        remarks = (*source.remarks, *(f"left out: {name}, {reason}" for name, reason in rejected.items()))
-        source = replace(source, remarks=remarks)
+        inspection = inspect_capture(prepared) if rejected else inspection
+    source = replace(source, remarks=(*source.remarks, *remarks))
     cloud = _cloud(source, prepared, options, step, open_bar)
     summary = _publish(source, prepared, cloud, problems(inspection), options)
     last.complete({})
