@@ -14,7 +14,7 @@ import pytest
 from neilfpp_method.__main__ import main as start
 from neilfpp_method.cli import main
 from neilfpp_method.commands import COMMANDS
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.native_signals import sigterm_delayed
 
 

@@ -339,9 +339,9 @@ MUTANTS: Sequence[Mutant] = (
     ),
     Mutant(
         "red and blue are swapped",
-        "data/images.py",
-        "return samples[..., [2, 1, 0, 3][: samples.shape[2]]]\n\n\ndef _png_samples",
-        "return samples\n\n\ndef _png_samples",
+        "data/image_parts.py",
+        "return samples[..., [2, 1, 0, 3][: samples.shape[2]]]",
+        "return samples",
         "data/test_images.py",
     ),
     Mutant(

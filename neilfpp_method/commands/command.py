@@ -21,6 +21,7 @@ MEASURED = 2.0
 Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
 """Type of an option that names a device."""
 Checkpoint = Literal["last", "sdf_init", "material_init", "joint"]
+"""Type of an option that names a checkpoint of a run: the last one, or that at the end of a stage."""
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,6 @@ def _flag_with_a_value(what: str, arguments: Sequence[str]) -> str | None:
             if word.lower() == "true":
                 return option
             if word.lower() == "false":
-                room, dot, flag = option.removeprefix("--").rpartition(".")
-                return f"--{room}{dot}no-{flag}"
+                part, dot, flag = option.removeprefix("--").rpartition(".")
+                return f"--{part}{dot}no-{flag}"
     return None

@@ -41,7 +41,7 @@ def run(options: Tradeoff) -> None:
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.settings.presets import fixed_geometry, preset
     from neilfpp_method.tradeoff.command import run_tradeoff
-    from neilfpp_method.tradeoff.rows import TradeoffRequest
+    from neilfpp_method.tradeoff.planned_runs import TradeoffRequest
 
     config = preset(options.preset)
     config = fixed_geometry(config) if options.host == "mesh" else config

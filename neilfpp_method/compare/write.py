@@ -21,7 +21,8 @@ from neilfpp_method.compare.figures import SHOWN, figure_rows, figures_parts
 from neilfpp_method.compare.parts import TablePart, runs_part, seconds_part, settings_part
 from neilfpp_method.compare.runs import ComparedRun, read_compared_runs
 from neilfpp_method.compare.sheet import Column, comparison_sheet
-from neilfpp_method.data.images import replacing, write_png
+from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.images import write_png
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.measured import count_of_views

@@ -1,4 +1,4 @@
-"""Test whether the colour that most image borders share is the background behind the scene.
+"""Find the colour of the background behind the scene, which most image borders show.
 
 If the images show the ground under a sky, or a table that extends beyond the images, half of the border has
 one colour as well. The views together distinguish these cases: everything that is not background must lie
@@ -8,18 +8,24 @@ inside the scene, in the visual hull (Laurentini 1994) of all pixels that do not
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float, Float32, Float64, Int
+from torch import Tensor
 
-from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement
+from neilfpp_method.data.pixel_store import BORDER_SHARE, border
+from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.silhouettes import AGREEMENT, MAX_VIEWS, Outline, agreement
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["MAX_RAYS", "leaves_room"]
+__all__ = ["border_color", "border_colors", "border_median"]
 
+BORDER_TOLERANCE = 0.02
+"""Largest deviation of a background pixel from the background colour, relative to the brighter of that colour
+and the median of the object."""
 MAX_RAYS = 1000
 """Largest number of rays that are tested."""
 PLACES = 65
@@ -30,7 +36,65 @@ MIN_INSIDE_SHARE = 0.9
 """Share of the rays that must have a test point inside the visual hull."""
 
 
-def leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalization: Normalization) -> bool:
+def border_color(pixels: PixelDataset) -> Float[Tensor, " 3"] | None:
+    """Return the linear RGB of the background; None if the image borders have no common colour.
+
+    The background colour is the median of the border, if at least half of the border pixels differ from it by
+    at most 2 % of the brighter of that colour and the object's median radiance, and if the other border
+    pixels can lie within the scene, which fails if that colour is the ground and the others are the sky.
+    """
+    numbers, views = border(pixels.store)
+    color = border_median(pixels)
+    if not len(numbers):
+        return None
+    tolerance = BORDER_TOLERANCE * max(float(color.max()), pixels.median_radiance())
+
+    def differs(colors: Float32[np.ndarray, "N 3"]) -> Bool[Tensor, " N"]:
+        return (pixels.linear(colors) - color).abs().amax(dim=-1) > tolerance
+
+    others = numbers[differs(pixels.store.colors(numbers, views)).numpy()]
+    if len(others) > (1 - BORDER_SHARE) * len(numbers):
+        return None
+    return color if _within_the_scene(pixels, others, differs) else None
+
+
+def border_median(pixels: PixelDataset) -> Float[Tensor, " 3"]:
+    """Return the median linear RGB of the image borders; black if no pixel there is valid."""
+    colors = pixels.linear(border_colors(pixels))
+    return colors.median(dim=0).values if len(colors) else colors.new_zeros(3)
+
+
+def border_colors(pixels: PixelDataset) -> Float32[np.ndarray, "B 3"]:
+    """Return the stored colours of the valid pixels on the image borders."""
+    return pixels.store.colors(*border(pixels.store))
+
+
+def _within_the_scene(
+    pixels: PixelDataset,
+    numbers: Int[np.ndarray, " N"],
+    differs: Callable[[Float32[np.ndarray, "P 3"]], Bool[Tensor, " P"]],
+) -> bool:
+    """Whether the content of some pixels can lie within the scene.
+
+    Args:
+        pixels: the pixels of all views.
+        numbers: indices of the pixels that are tested.
+        differs: tells which colours differ from that of the background.
+    """
+    if not len(numbers):
+        return True
+    step = -(-len(numbers) // MAX_RAYS)
+    rays = pixels.numbered(torch.from_numpy(numbers[::step].copy())).rays
+    outlines = []
+    for i in range(0, len(pixels.views), -(-len(pixels.views) // MAX_VIEWS)):
+        view = pixels.views[i]
+        inside = differs(pixels.store.view_colors(i)).view(view.camera.height, -1)
+        outlines.append(Outline(view, inside.numpy()))
+        pixels.store.release()
+    return _leaves_room(outlines, rays, pixels.capture.normalization)
+
+
+def _leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalization: Normalization) -> bool:
     """Return whether the pixels that do not have the background colour can lie within the scene.
 
     Args:

@@ -17,7 +17,7 @@ from neilfpp_method.data.bracket_alignment import Aligned, align
 from neilfpp_method.data.brackets import Bracket, Response, calibrate, linear_response, merge, srgb_response
 from neilfpp_method.data.images import IMAGE_SUFFIXES, read_image, write_exr, write_png
 from neilfpp_method.data.photo_exposure import exposures_of
-from neilfpp_method.data.raw import RAW_SUFFIXES, develop
+from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
 from neilfpp_method.data.views import inside
 from neilfpp_method.errors import UserError
 
@@ -157,8 +157,8 @@ def merge_brackets(
             photographs in pixels, which is None if the pose was skipped.
 
     Raises:
-        UserError: an image cannot be read; the images of a pose differ in size; or the response cannot be
-            calibrated.
+        UserError: an image cannot be read; the images of a pose differ in size; the response of camera RAW is
+            given as sRGB; or the response cannot be calibrated.
     """
     middle = float(np.median([exposure for bracket in brackets.values() for exposure in bracket.values()]))
     decode = _response(brackets, response)
@@ -174,14 +174,18 @@ def merge_brackets(
         on_merged(name, moved)
 
 
-def _response(brackets: Brackets, response: str) -> Response:
-    raw = {image.suffix.lower() in RAW_SUFFIXES for bracket in brackets.values() for image in bracket}
-    if response != "auto" or raw == {True}:
-        return {"linear": linear_response, "srgb": srgb_response}[
-            "linear" if response == "auto" else response
-        ]
-    if len(raw) > 1:
-        raise UserError("camera RAW and other images in one folder", "keep one of the two")
+def _response(brackets: Brackets, response: Literal["auto", "linear", "srgb"]) -> Response:
+    images = [image for bracket in brackets.values() for image in bracket]
+    raw = [image for image in images if image.suffix.lower() in RAW_SUFFIXES]
+    if response == "srgb":
+        check_not_raw(raw)
+        return srgb_response
+    if response == "linear" or len(raw) == len(images):
+        return linear_response
+    if raw:
+        raise UserError(
+            f"{raw[0]} is camera RAW, and other images of the folder are not", "keep images of one kind"
+        )
     alike = Counter(tuple(bracket.values()) for bracket in brackets.values()).most_common(1)[0][0]
     usable = [bracket for bracket in brackets.values() if tuple(bracket.values()) == alike]
     step = -(-len(usable) // CALIBRATED)

@@ -106,8 +106,9 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
 
 
 def merge(bracket: Bracket, response: Response) -> Merged:
-    """Compute radiance E = Σ w f(z)/t / Σ w over the exposures t, per channel, in the unit of f per unit of
-    t.
+    """Compute radiance E = Σ w f(z)/t / Σ w over the exposures t, per channel.
+
+    The unit of E is that of the response f per unit of t.
 
     The weight is w = t · max(min(z − z₀, z₁ − z), 0), because photon noise makes the variance of f(z)/t
     proportional to 1/t, and values near both ends of the range are unreliable. A channel that is dark at

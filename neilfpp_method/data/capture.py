@@ -6,7 +6,6 @@ loaded.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,8 +16,10 @@ import numpy as np
 
 from neilfpp_method.data import capture_folder
 from neilfpp_method.data.formats import blender, colmap, dtu, nerfactor, nero, sfm_scene, transforms
+from neilfpp_method.data.image_parts import ImageHeader
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
 from neilfpp_method.data.raw import RAW_SUFFIXES
+from neilfpp_method.data.split import held_out_views
 from neilfpp_method.data.views import (
     Camera,
     CaptureFiles,
@@ -26,36 +27,41 @@ from neilfpp_method.data.views import (
     SceneSource,
     View,
     check_camera,
-    inside,
     plain_name,
 )
 from neilfpp_method.errors import UserError
 
-__all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalization", "Reader", "View", "load_capture"]
+__all__ = ["BOX_SOURCES", "READERS", "Camera", "Capture", "Normalization", "Reader", "View", "load_capture"]
 
-TEST_EVERY = 8
-"""Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
+
+@dataclass(frozen=True)
+class UnusableCameras:
+    """A pattern of files with cameras that cannot be used, the reason, and the remedy."""
+
+    pattern: str
+    reason: str
+    remedy: str
+
 
 UNUSABLE = (
-    (
+    UnusableCameras(
         "transforms_*.json",
         "no transforms_train.json",
         "add the file of the training views, or name a file that lists all views transforms.json",
     ),
-    (
+    UnusableCameras(
         "test_[0-9]*/metadata.json",
         "no train_000/metadata.json",
         "add the folders of the training views",
     ),
-    (
+    UnusableCameras(
         "cams/*_cam.txt",
         "cameras of MVSNet and BlendedMVS are not read",
         "write them as transforms.json, or run neilfpp prepare on the folder of the images",
     ),
 )
-"""Patterns of files with cameras that cannot be used, the reason, and the remedy."""
 
-FOUND: Mapping[SceneSource, str] = {
+BOX_SOURCES: Mapping[SceneSource, str] = {
     "box": ", as stated by the capture",
     "points": ", computed from the points",
     "focus": ", from the point that the cameras look at, because the points extend far beyond it",
@@ -159,10 +165,10 @@ class Capture:
                 f"{self.root.resolve().name} ({self.format}): {len(self.views)} views of {size}, "
                 f"{len(self.train_views)} to train on and {len(self.test_views)} to test on",
                 f"pixels: {'linear HDR' if self.hdr else 'display values (sRGB)'}; "
-                f"mask files: {_of(masks, len(self.views))}; "
+                f"mask files: {_masks_text(masks, len(self.views))}; "
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
                 f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalization.scale:.4g} "
-                "world units" + FOUND[self.scene_from],
+                "world units" + BOX_SOURCES[self.scene_from],
             ]
         )
 
@@ -207,15 +213,15 @@ def load_capture(
         views=files.views,
         normalization=files.normalization,
         hdr={"auto": hdr, "linear": True, "srgb": False}[response],
-        test=_test_views(root, files, test_every, test),
+        test=held_out_views(root, files, test_every, test),
         point_cloud=files.point_cloud,
         scene_from=files.scene_from,
     )
 
 
-def _of(count: int, views: int) -> str:
+def _masks_text(masks: int, views: int) -> str:
     """The number of mask files, with that of the views if some have none."""
-    return f"{count} of {views}" if 0 < count < views else str(count or "none")
+    return f"{masks} of {views}" if 0 < masks < views else str(masks or "none")
 
 
 def _recognize(root: Path) -> str:
@@ -234,11 +240,13 @@ def _recognize(root: Path) -> str:
 
 
 def _check_cameras(root: Path) -> None:
-    """Raise a `UserError` if there are cameras, but none that can be used, or if they are in a sub-folder."""
-    for pattern, reason, remedy in UNUSABLE:
-        found = min(root.glob(pattern), default=None)
+    """Raise a `UserError` if there are cameras that cannot be used, or if a sub-folder is a capture."""
+    for cameras in UNUSABLE:
+        found = min(root.glob(cameras.pattern), default=None)
         if found is not None:
-            raise UserError(f"{root}: there is {found.relative_to(root)}, but {reason}", remedy)
+            raise UserError(
+                f"{root}: there is {found.relative_to(root)}, but {cameras.reason}", cameras.remedy
+            )
     for folder in sorted(path for path in root.iterdir() if path.is_dir()):
         # A folder that must not be read is none of the user's captures.
         with suppress(OSError):
@@ -256,84 +264,47 @@ def _photographs(root: Path) -> int:
     )
 
 
-def _check_views(views: tuple[View, ...]) -> bool:
-    """Check names, cameras, image sizes and pixel types of all views; return whether the files are HDR."""
-    names: dict[str, View] = {}
-    hdr: dict[bool, View] = {}
+def _check_views(views: Sequence[View]) -> bool:
+    """Check all views; return whether their images are HDR, which either all or none must be."""
+    by_name: dict[str, View] = {}
+    by_kind: dict[bool, View] = {}
     for view in views:
-        check_camera(view.camera, str(view.image))
-        if not plain_name(view.name):
-            raise UserError(f"{view.image}: '{view.name}' is not a valid file name", "rename the view")
-        if view.name in names:
+        _check_view(view)
+        if view.name in by_name:
             raise UserError(
-                f"{view.image} and {names[view.name].image} have the same name", "rename one of them"
+                f"{view.image} and {by_name[view.name].image} have the same name", "rename one of them"
             )
-        names[view.name] = view
-        if not all(np.isfinite(f) and f > 0 for f in (view.exposure, *view.white_balance)):
-            raise UserError(
-                f"{view.image}: exposure and white balance are not all positive", "correct the factors"
-            )
-        size = (view.camera.width, view.camera.height)
-        headers = {path: image_header(path) for path in (view.image, view.mask, view.valid) if path}
-        hdr.setdefault(headers[view.image].hdr, view)
-        for path, header in headers.items():
-            if (header.width, header.height) != size:
-                turned = (header.height, header.width) == size
-                remedy = (
-                    "rotate the pixels as the EXIF data of the image states"
-                    if turned
-                    else "resize the image, or scale its camera"
-                )
-                raise UserError(
-                    f"{path}: {header.width}×{header.height} pixels where the camera has {size[0]}×{size[1]}",
-                    remedy,
-                )
-    if len(hdr) > 1:
-        raise UserError(f"{hdr[True].image} is HDR and {hdr[False].image} is LDR", "use images of one kind")
-    return next(iter(hdr))
-
-
-# ------------------------------------------------------------------------------------------------------ split
-
-
-def _test_views(
-    root: Path, files: CaptureFiles, test_every: int | None, test: Collection[str | int] | None
-) -> frozenset[str]:
-    split, views = root / "split.json", files.views
-    if test is not None:
-        held_out = _named(views, test, "test")
-    elif test_every is None and split.is_file():
-        held_out = _named(views, _read_split(inside(root, split)), str(split))
-    elif test_every is None and files.test is not None:
-        held_out = _named(views, files.test, "the capture's own split")
-    else:
-        every = TEST_EVERY if test_every is None else test_every
-        if every < 0:
-            raise UserError(
-                f"every {every}-th view cannot be held out", "give 2 or more, or 0 to hold out no view"
-            )
-        held_out = frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()
-    if len(held_out) == len(views):
-        raise UserError(f"{root}: all {len(views)} views are held out for testing", "leave some to train on")
-    return held_out
-
-
-def _named(views: tuple[View, ...], wanted: Collection[str | int], where: str) -> frozenset[str]:
-    """Names of views that are given by name or by number."""
-    names = {**{view.index: view.name for view in views}, **{view.name: view.name for view in views}}
-    for key in wanted:
-        if key not in names:
-            raise UserError(f"{where}: there is no view {key!r}", "name views by image name or number")
-    return frozenset(names[key] for key in wanted)
-
-
-def _read_split(path: Path) -> list[str | int]:
-    try:
-        test = json.loads(path.read_text("utf-8-sig"))["test"]
-    except (ValueError, OSError, RecursionError, KeyError, TypeError) as error:
+        by_name[view.name] = view
+        by_kind.setdefault(_checked_header(view).hdr, view)
+    if len(by_kind) > 1:
         raise UserError(
-            f"{path}: not a JSON object with the key 'test' ({error})", 'write {"test": [0, 8]}'
-        ) from error
-    if not isinstance(test, list) or not all(isinstance(key, str | int) for key in test):
-        raise UserError(f"{path}: 'test' is not a list of view names or numbers", 'write {"test": [0, 8]}')
-    return test
+            f"{by_kind[True].image} is HDR and {by_kind[False].image} is LDR", "use images of one kind"
+        )
+    return next(iter(by_kind))
+
+
+def _check_view(view: View) -> None:
+    """Check the camera, the name and the factors of a view."""
+    check_camera(view.camera, str(view.image))
+    if not plain_name(view.name):
+        raise UserError(f"{view.image}: '{view.name}' is not a valid file name", "rename the view")
+    if not all(np.isfinite(f) and f > 0 for f in (view.exposure, *view.white_balance)):
+        raise UserError(
+            f"{view.image}: exposure and white balance are not all positive", "correct the factors"
+        )
+
+
+def _checked_header(view: View) -> ImageHeader:
+    """The header of the image of a view; image and masks must have the size of the camera."""
+    size = (view.camera.width, view.camera.height)
+    headers = {path: image_header(path) for path in (view.image, view.mask, view.valid) if path}
+    for path, header in headers.items():
+        if (header.width, header.height) != size:
+            remedy = "resize the image, or scale its camera"
+            if (header.height, header.width) == size:
+                remedy = "rotate the pixels as the EXIF data of the image states"
+            raise UserError(
+                f"{path}: {header.width}×{header.height} pixels where the camera has {size[0]}×{size[1]}",
+                remedy,
+            )
+    return headers[view.image]

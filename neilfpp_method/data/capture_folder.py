@@ -25,7 +25,7 @@ VERSION = 1
 
 
 def recognize(root: Path) -> bool:
-    """Return whether the folder has a `capture.json` of this format; in run folders it has another format."""
+    """Return whether the folder has a `capture.json` of this format; that of a run folder is another file."""
     path = root / FILE
     return path.is_file() and FORMAT.encode() in path.read_bytes()
 
@@ -35,8 +35,7 @@ def read(root: Path) -> CaptureFiles:
 
     Raises:
         UserError: `capture.json` is malformed or of a later version, or names a file that is missing or
-        outside
-            of the folder.
+            outside of the folder.
     """
     entry = Entry.load(inside(root, root / FILE))
     entry["format"].word(FORMAT)
@@ -61,10 +60,10 @@ def read(root: Path) -> CaptureFiles:
 
 
 def read_scene(entry: Entry) -> Normalization:
-    """Read the scene box from an entry with `center` and `radius`.
+    """Read the scene box from an entry with `centre` and `radius`, in world units.
 
     Raises:
-        UserError: they are not numbers, or the radius is not positive.
+        UserError: one of them is missing or not a number, or the radius is not positive.
     """
     x, y, z = map(float, entry["centre"].numbers((3,)))
     radius = entry["radius"].number()

@@ -40,12 +40,12 @@ class PixelSet:
 
     Args:
         bits: the bits of all pixels; a whole number of blocks, 0 in the padding.
-        of: mask of the bits that are compared.
-        are: required value of these bits.
+        having: the bits that a pixel of the set has, such as `VALID | MASK`.
+        lacking: the bits that it does not have.
     """
 
-    def __init__(self, bits: UInt8[np.ndarray, " P"], of: int, are: int) -> None:
-        self._bits, self._of, self._are = bits.reshape(-1, BLOCK), of, are
+    def __init__(self, bits: UInt8[np.ndarray, " P"], having: int, lacking: int = 0) -> None:
+        self._bits, self._having, self._compared = bits.reshape(-1, BLOCK), having, having | lacking
         counts = [
             self._chosen(slice(k, k + BLOCKS_AT_ONCE)).sum(axis=1)
             for k in range(0, len(self._bits), BLOCKS_AT_ONCE)
@@ -54,7 +54,7 @@ class PixelSet:
         self.count = int(self._before[-1])
 
     def _chosen(self, blocks: slice | Int[np.ndarray, " N"]) -> Bool[np.ndarray, "N B"]:
-        return (self._bits[blocks] & self._of) == self._are
+        return (self._bits[blocks] & self._compared) == self._having
 
     def draw(self, count: int) -> Int[Tensor, " count"]:
         """Draw `count` indices with torch's global generator on the CPU."""
@@ -78,14 +78,14 @@ class PixelDraws:
     """
 
     def __init__(self, bits: UInt8[np.ndarray, " P"], total: int) -> None:
-        self.valid = PixelSet(bits, VALID, VALID)
+        self.valid = PixelSet(bits, VALID)
         self._left_out = torch.zeros(0, dtype=torch.long)
-        near = PixelSet(bits, VALID | NEAR, VALID | NEAR)
-        self._all = self.valid.count == total
+        near = PixelSet(bits, VALID | NEAR)
+        self._all_valid = self.valid.count == total
         # If nearly all pixels are near the object, the draws are uniform.
         self._parts = None
         if 0 < near.count < NEAR_SHARE * self.valid.count:
-            self._parts = (near, PixelSet(bits, VALID | NEAR, VALID))
+            self._parts = (near, PixelSet(bits, VALID, lacking=NEAR))
 
     def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
         """Exclude pixels from all later draws; they must be few, near the object and elsewhere."""
@@ -94,29 +94,30 @@ class PixelDraws:
     def draw(self, count: int) -> Int[Tensor, " count"]:
         """Draw `count` indices of valid pixels, with repetition and in random order."""
         if self._parts is None:
-            return self._of(self.valid, count)
+            return self._draw_from(self.valid, count)
         near, rest = self._parts
         first = round(NEAR_SHARE * count)
-        drawn = torch.cat([self._of(near, first), self._of(rest, count - first)])
+        drawn = torch.cat([self._draw_from(near, first), self._draw_from(rest, count - first)])
         # Shuffled, because a step may use the first pixels only.
         return drawn[torch.randperm(count)]
 
-    def _of(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
+    def _draw_from(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
         """Draw from one set; excluded pixels are drawn again, so that all others stay equally likely."""
-        drawn = self._any_of(pixels, count)
+        drawn = self._draw_any(pixels, count)
         while len(again := torch.nonzero(torch.isin(drawn, self._left_out))[:, 0]):
-            drawn[again] = self._any_of(pixels, len(again))
+            drawn[again] = self._draw_any(pixels, len(again))
         return drawn
 
-    def _any_of(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
-        # If all pixels are valid, the k-th valid pixel is pixel k.
-        everything = self._all and pixels is self.valid
-        return torch.randint(pixels.count, (count,)) if everything else pixels.draw(count)
+    def _draw_any(self, pixels: PixelSet, count: int) -> Int[Tensor, " count"]:
+        """Draw from one set, also pixels that are excluded."""
+        if self._all_valid and pixels is self.valid:
+            # The k-th valid pixel is pixel k.
+            return torch.randint(pixels.count, (count,))
+        return pixels.draw(count)
 
 
 def near_object(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Return the pixels on the object or within `NEAR_DISTANCE` of it, computed at `SMALL_SIDE` pixels a
-    side.
+    """Return the pixels on the object or within `NEAR_DISTANCE` of it, computed on a reduced mask.
 
     >>> mask = np.zeros((100, 100), bool)
     >>> mask[50, 50] = True

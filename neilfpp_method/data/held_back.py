@@ -42,16 +42,15 @@ def hold_back(pixels: PixelDataset, seed: int, patches: int = PATCHES) -> PixelB
         The pixels of the patches that are valid and on the object.
     """
     bits = pixels.store.bits
-    of_object = PixelSet(bits, VALID | MASK, VALID | MASK)
+    of_object = PixelSet(bits, VALID | MASK)
     count = min(patches, int(MAX_SHARE * of_object.count) // SIDE**2)
-    chosen: list[Int[np.ndarray, " N"]] = []
     taken: set[int] = set()
     in_view: Counter[int] = Counter()
+    max_in_view = -(-count // len(pixels.views))
     for view, patch in _places(pixels, of_object, seed, TRIES * count):
-        if len(chosen) == count:
+        if in_view.total() == count:
             break
-        if in_view[view] < -(-count // len(pixels.views)) and taken.isdisjoint(patch.tolist()):
-            chosen.append(patch)
+        if in_view[view] < max_in_view and taken.isdisjoint(patch.tolist()):
             taken.update(patch.tolist())
             in_view[view] += 1
     numbers = np.array(sorted(taken), dtype=np.int64)

@@ -9,30 +9,24 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import OpenEXR
-import tifffile
 from jaxtyping import Float, Shaped
 from PIL import Image
 
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.exr import exr_header, exr_samples
+from neilfpp_method.data.image_parts import ImageHeader, rgb_of_opencv
+from neilfpp_method.data.radiance_hdr import hdr_header, hdr_samples
+from neilfpp_method.data.tiff import tiff_header, tiff_samples
 from neilfpp_method.errors import UserError
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "ImageFile",
-    "ImageHeader",
-    "image_header",
-    "read_image",
-    "replacing",
-    "write_exr",
-    "write_png",
-]
+__all__ = ["IMAGE_SUFFIXES", "ImageFile", "image_header", "read_image", "write_exr", "write_png"]
 
 MAX_SIDE = 65_536
 """Longest side of an image, in pixels."""
@@ -40,19 +34,8 @@ MAX_PIXELS = 2**30
 """Largest number of pixels of an image; bounds the memory."""
 LABEL = 1.001 / 255
 """Largest value of a mask file, in [0, 1], at which it contains labels instead of brightness: 1 of 255."""
-RADIANCE_HEADER = 65_536
-"""Largest size of the header of a Radiance HDR file, in bytes. Tools append their command lines to it."""
 SIGNATURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
 """First bytes of PNG and JPEG files, which are recognised by them, because renamed files are common."""
-
-
-@dataclass(frozen=True)
-class ImageHeader:
-    """Size of an image, and whether its samples are floating point (`hdr`), which are linear radiance."""
-
-    width: int
-    height: int
-    hdr: bool
 
 
 @dataclass(frozen=True)
@@ -97,113 +80,17 @@ def _pillow_header(path: Path) -> ImageHeader:
         return ImageHeader(*image.size, hdr=False)
 
 
-def _tiff_header(path: Path) -> ImageHeader:
-    with tifffile.TiffFile(path) as file:
-        page = _tiff_page(file)
-        return ImageHeader(page.imagewidth, page.imagelength, hdr=np.issubdtype(page.dtype, np.floating))
-
-
-def _tiff_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
-    """The first page that is no reduced copy of another: a thumbnail may come before the image."""
-    return next((page for page in file.pages if not page.is_reduced), file.pages[0])
-
-
-def _radiance_lines(path: Path) -> list[bytes]:
-    """The lines of the header, an empty line, and the line with the size."""
-    with path.open("rb") as file:
-        lines = file.read(RADIANCE_HEADER).split(b"\n")
-    if b"" not in lines:
-        raise ValueError(f"its header does not end within {RADIANCE_HEADER} bytes with an empty line")
-    return lines[: lines.index(b"") + 2]
-
-
-def _radiance_axes(line: bytes) -> dict[bytes, int]:
-    """The axes of a file and their lengths, the slow one first: {b"-Y": 480, b"+X": 640} for `-Y 480 +X 640`.
-
-    Raises:
-        ValueError: the line is no size.
-    """
-    slow, rows, fast, columns = line.split()
-    if {slow[:1], fast[:1]} - {b"+", b"-"} or {slow[1:], fast[1:]} != {b"X", b"Y"}:
-        raise ValueError("its size is not of the form -Y 480 +X 640")
-    return {slow: int(rows), fast: int(columns)}
-
-
-def _radiance_header(path: Path) -> ImageHeader:
-    lines = _radiance_lines(path)
-    if b"FORMAT=32-bit_rle_xyze" in lines:
-        raise ValueError("its colours are XYZ, not RGB")
-    sizes = {axis[1:]: size for axis, size in _radiance_axes(lines[-1]).items()}
-    return ImageHeader(sizes[b"X"], sizes[b"Y"], hdr=True)
-
-
-def _radiance_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    """Radiance: stored values are multiplied by every EXPOSURE of the header, and their channels by every
-    COLORCORR, and rows may be stored in any order. OpenCV undoes none of this.
-    """
-    lines = _radiance_lines(path)
-    factors = np.ones(3)
-    for line in lines:
-        if line.startswith((b"EXPOSURE=", b"COLORCORR=")):
-            factors *= [float(word) for word in line.split(b"=")[1].split()]
-    if not (np.isfinite(factors).all() and (factors > 0).all()):
-        raise ValueError(f"an exposure or a color correction of {factors.min():g}")
-    axes = _radiance_axes(lines[-1])
-    pixels = path.read_bytes()[len(b"\n".join(lines)) :]
-    upright = b"\n".join([*lines[:-1], b"-Y %d +X %d" % tuple(axes.values())]) + pixels
-    samples = _rgb(cv2.imdecode(np.frombuffer(upright, np.uint8), cv2.IMREAD_UNCHANGED))
-    samples = samples if next(iter(axes)).endswith(b"Y") else samples.swapaxes(0, 1)
-    return samples[:: -1 if b"+Y" in axes else 1, :: -1 if b"-X" in axes else 1] / factors.astype(np.float32)
-
-
 def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     # IMREAD_UNCHANGED also ignores the EXIF orientation.
-    return _rgb(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
-
-
-def _rgb(samples: Shaped[np.ndarray, "H W ..."] | None) -> Shaped[np.ndarray, "H W C"]:
-    """What OpenCV decoded, with the channels in the order of this module."""
-    if samples is None:
-        raise ValueError("damaged, or of a kind that OpenCV does not know")
-    if samples.ndim == 2:
-        return samples[..., None]
-    return samples[..., [2, 1, 0, 3][: samples.shape[2]]]
+    return rgb_of_opencv(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
 
 
 def _png_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     with Image.open(path) as image:
         if "transparency" in image.info and image.mode in ("P", "L", "1"):
-            # OpenCV ignores the transparent colors of palettes and of grey images.
+            # OpenCV ignores the transparent colours of palettes and of grey images.
             return np.asarray(image.convert("RGBA"))
     return _opencv_samples(path)
-
-
-def _tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    with tifffile.TiffFile(path) as file:
-        page = _tiff_page(file)
-        if page.photometric.name not in TIFF_COLORS:
-            raise ValueError(f"its colours are {page.photometric.name}, not RGB")
-        is_plain = page.compression.name in TIFF_UNPACKED and page.predictor in TIFF_PREDICTORS
-        if is_plain and page.photometric.name in TIFF_STORED and page.bitspersample in TIFF_BITS:
-            # OpenCV multiplies 8-bit colours by an alpha that is not associated, refuses rotated images and
-            # further channels, does not support half precision, and reads separate planes as pixels.
-            samples = page.asarray()
-            is_planar = page.planarconfig == tifffile.PLANARCONFIG.SEPARATE and page.samplesperpixel > 1
-            samples = np.atleast_3d(np.moveaxis(samples, 0, -1) if is_planar else samples)
-            return _colors_and_alpha(samples, 3 if page.photometric.name == "RGB" else 1, page.extrasamples)
-        if ALPHA_APART in page.extrasamples and page.dtype == np.uint8:
-            raise ValueError(f"{page.compression.name} compression with an alpha that is not associated")
-        _, samples = cv2.imreadmulti(str(path), page.index, 1, flags=cv2.IMREAD_UNCHANGED)
-    return _rgb(samples[0] if samples else None)
-
-
-def _colors_and_alpha(
-    samples: Shaped[np.ndarray, "H W C"], colors: int, extra: tuple[int, ...]
-) -> Shaped[np.ndarray, "H W c"]:
-    """Colours and alpha of a TIFF. A single further channel of unspecified meaning is taken as the alpha."""
-    alpha = [i for i, kind in enumerate(extra) if kind != tifffile.EXTRASAMPLE.UNSPECIFIED]
-    alpha = alpha or [0] * (len(extra) == 1)
-    return samples[..., [*range(colors), *(colors + i for i in alpha[:1])]]
 
 
 def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
@@ -223,30 +110,21 @@ class Format:
     samples: Callable[[Path], np.ndarray]
 
 
-TIFF = Format(_tiff_header, _tiff_samples)
+TIFF = Format(tiff_header, tiff_samples)
 JPEG = Format(_pillow_header, _jpeg_samples)
 FORMATS: Mapping[str, Format] = {
     ".exr": Format(_exr_header, exr_samples),
-    ".hdr": Format(_radiance_header, _radiance_samples),
+    ".hdr": Format(hdr_header, hdr_samples),
     ".tif": TIFF,
     ".tiff": TIFF,
     ".png": Format(_pillow_header, _png_samples),
     ".jpg": JPEG,
     ".jpeg": JPEG,
 }
+"""The formats by the suffix of a file, in small letters."""
 IMAGE_SUFFIXES = tuple(FORMATS)
-TIFF_COLORS = ("MINISBLACK", "MINISWHITE", "RGB", "PALETTE", "SEPARATED", "YCBCR")
-"""Meanings of the colours of a TIFF file that are read."""
-TIFF_STORED = ("MINISBLACK", "RGB")
-"""Meanings of the colours with which stored values are brightness or RGB."""
-TIFF_UNPACKED = ("NONE", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS")
-"""Compressions that tifffile decodes without further packages; OpenCV decodes the others."""
-TIFF_PREDICTORS = (tifffile.PREDICTOR.NONE, tifffile.PREDICTOR.HORIZONTAL)
-"""Predictors that tifffile undoes without further packages."""
-TIFF_BITS = (8, 16, 32, 64)
-"""Sizes of samples that fill the type in which they are decoded."""
-ALPHA_APART = tifffile.EXTRASAMPLE.UNASSALPHA
 FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float16": 1.0, "float32": 1.0, "float64": 1.0}
+"""Sample that becomes 1, by the type of the samples."""
 
 
 def image_header(path: Path) -> ImageHeader:
@@ -288,6 +166,7 @@ def read_image(path: Path) -> ImageFile:
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
+    """Turn the exceptions of decoders into a `UserError` that names the file."""
     try:
         with _decoders_silent():
             yield
@@ -338,29 +217,6 @@ def _check_size(path: Path, width: int, height: int) -> None:
 
 
 # ---------------------------------------------------------------------------------------------------- writing
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Provide a temporary path that is renamed to `path` at the end of the block, or removed if the block
-    fails.
-
-    Readers never see a partial file, even if the process is killed. Missing folders are created.
-
-    Raises:
-        UserError: the operating system refuses to write the file; an existing file is kept.
-    """
-    temporary = path.parent / f".{path.stem}.{os.getpid()}{path.suffix}"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        remedy = "make room there, or choose a folder that can be written"
-        raise UserError(f"{path}: cannot be written ({error.strerror or error})", remedy) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]]) -> None:

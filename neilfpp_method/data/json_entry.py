@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.errors import UserError
 
 __all__ = ["Entry", "write_json"]

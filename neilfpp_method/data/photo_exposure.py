@@ -87,7 +87,7 @@ def read_exposures(path: Path) -> Mapping[str, float]:
         else:
             lines = (line.split("#")[0].strip() for line in text.splitlines())
             pairs = [line.rsplit(maxsplit=1) for line in lines if line]
-        listed = {name: float(Fraction(str(seconds))) for name, seconds in pairs}
+        listed = {name: _seconds(str(seconds)) for name, seconds in pairs}
     except (OSError, ValueError, AttributeError, ZeroDivisionError, OverflowError, RecursionError) as error:
         raise UserError(
             f"{path}: no list of exposures ({error})", "write lines 'NAME SECONDS', as 'a.jpg 1/60'"
@@ -96,3 +96,8 @@ def read_exposures(path: Path) -> Mapping[str, float]:
         if not (math.isfinite(seconds) and seconds > 0):
             raise UserError(f"{path}: the exposure of {name} is {seconds}", "give seconds above 0")
     return listed
+
+
+def _seconds(text: str) -> float:
+    # Only quotients are given to `Fraction`: it would compute all digits of 1e999999999.
+    return float(Fraction(text)) if "/" in text else float(text)

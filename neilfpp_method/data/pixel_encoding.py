@@ -77,7 +77,7 @@ def _half(color: Float32[np.ndarray, "H W 3"]) -> EncodedView | None:
     some = color.reshape(-1)[:: -(-color.size // MEDIAN_SAMPLES)]
     positive = some[some > 0]
     too_dark = len(positive) > 0 and float(np.median(positive)) * scale < MIN_MEDIAN
-    if len(positive) and (too_dark or not np.isfinite(np.float32(scale))):
+    if too_dark or scale > float(np.finfo(np.float32).max):
         return None
     return EncodedView((color * np.float32(scale)).astype(np.float16), scale)
 

@@ -2,8 +2,7 @@
 
     color.npy    (P, 3) codes of `pixel_encoding`: 3 bytes per pixel for 8-bit images, else 6 or 12
     bits.npy     (P,) one byte: valid, mask, mask known, near the object (`drawing`); padded to whole blocks
-    store.json   the inputs of the store; it is written last, so a folder without it contains no complete
-    store
+    store.json   the inputs of the store; it is written last, so a folder without it is incomplete
 
 Views are read one at a time, so building a store takes the memory of one view. A store is used again if it
 was built from the same files (name, size, modification time), cameras and factors; otherwise it is built
@@ -26,8 +25,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Shaped, UInt8
 
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.drawing import BLOCK, KNOWN, MASK, NEAR, VALID, near_object
-from neilfpp_method.data.images import replacing
 from neilfpp_method.data.pixel_encoding import BYTES, ENCODINGS, Encoding, encodings_for
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.view_pixels import read_view
@@ -74,7 +73,7 @@ class PixelStore:
     def __len__(self) -> int:
         return int(self.starts[-1])
 
-    def rows(self, i: int) -> slice:
+    def indices(self, i: int) -> slice:
         """Return the indices of the pixels of view `i`."""
         return slice(int(self.starts[i]), int(self.starts[i + 1]))
 
@@ -89,7 +88,7 @@ class PixelStore:
 
     def view_colors(self, i: int) -> Float32[np.ndarray, "N 3"]:
         """Return the colours of a view."""
-        return self.encoding.decode(np.asarray(self.codes[self.rows(i)]), self.scales[i])
+        return self.encoding.decode(np.asarray(self.codes[self.indices(i)]), self.scales[i])
 
     def release(self) -> None:
         """Unmap the pages of the files; later reads map them again."""
@@ -113,8 +112,7 @@ def load_pixels(
     on_view: Callable[[str], None] | None = None,
     exact: bool = False,
 ) -> PixelStore:
-    """Load the pixels of views: from a store in `folder` if it has the same inputs, otherwise from the
-    images.
+    """Load the pixels of views: from a store with the same inputs if there is one, else from the images.
 
     Args:
         views: the views, at least one.
@@ -208,8 +206,8 @@ def _fill(
             encoded = encoding.encode(pixels.color)
             if encoded is None:
                 return None
-            codes[store.rows(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
-            bits[store.rows(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
+            codes[store.indices(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
+            bits[store.indices(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
             if pixels.mask is None:
                 unknown.append(i)
             store.release()
@@ -223,7 +221,7 @@ def _fill(
     else:
         # In views without a mask every pixel may be on the object, so all count as near it.
         for i in unknown:
-            bits[store.rows(i)] |= NEAR
+            bits[store.indices(i)] |= NEAR
     return store
 
 
@@ -239,8 +237,7 @@ def _near(mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, " N"]:
 
 
 def _mask_from_background(store: PixelStore) -> None:
-    """If no view has a mask, mark the pixels whose colour is exactly that of most border pixels as
-    background.
+    """Mark the pixels as background whose colour is exactly that of most border pixels.
 
     For all other pixels the mask remains unknown. Rendered captures and clipped backdrops have such pixels;
     photographs of other backdrops have few because of noise.
@@ -256,17 +253,15 @@ def _mask_from_background(store: PixelStore) -> None:
         return
     for i, view in enumerate(store.views):
         background = (store.view_colors(i) == color).all(axis=-1)
-        bits = store.bits[store.rows(i)] & np.uint8(VALID)
+        bits = store.bits[store.indices(i)] & np.uint8(VALID)
         bits |= np.where(background, KNOWN, MASK).astype(np.uint8)
         shape = (view.camera.height, view.camera.width)
-        store.bits[store.rows(i)] = bits | _near(~background.reshape(shape))
+        store.bits[store.indices(i)] = bits | _near(~background.reshape(shape))
         store.release()
 
 
 def _median(values: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, " C"]:
-    """The lower median per channel. It is one of the values, so a colour that most pixels have is found
-    exactly.
-    """
+    """The lower median per channel: one of the values, so the colour of most pixels is found exactly."""
     return np.partition(values, (len(values) - 1) // 2, axis=0)[(len(values) - 1) // 2]
 
 
@@ -289,7 +284,7 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
 def _plane(path: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     """Make an array of zeros in memory, or in a file.
 
-    The blocks of the file are allocated at once: writing to a memory map on a full disk would end the
+    The blocks of the file are allocated at once, because writing to a memory map on a full disk would end the
     process.
     """
     if path is None:

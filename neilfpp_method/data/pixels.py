@@ -12,11 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int
 from torch import Tensor
 
-from neilfpp_method.data.backdrop import MAX_RAYS, leaves_room
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.drawing import KNOWN, MASK, NEAR, VALID, PixelDraws
-from neilfpp_method.data.pixel_store import PixelStore, advise_random_access, border, load_pixels
-from neilfpp_method.data.silhouettes import MAX_VIEWS, Outline
+from neilfpp_method.data.image_gradient import NEIGHBORS, image_gradient, scharr
+from neilfpp_method.data.pixel_store import PixelStore, advise_random_access, load_pixels
 from neilfpp_method.data.views import CameraRays, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import luminance, srgb_to_linear, tone_map
@@ -24,21 +23,12 @@ from neilfpp_method.structures import PixelBatch
 
 __all__ = ["PixelDataset"]
 
-BORDER_TOLERANCE = 0.02
-"""Largest deviation of a background pixel from the background colour, relative to the brighter of that colour
-and the median of the object."""
-
-BORDER_SHARE = 0.5
-"""Smallest share of the border pixels that must have the background colour."""
-
 DARK = 1e-3
 """Luminance below which a pixel counts as black, relative to the mean of the object."""
 
 MIDDLE_GRAY = 0.18
 """Linear value to which the median of the object is brought for image gradients: photographic middle grey."""
 
-NEIGHBORS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)])
-"""Offsets (row, column) of the 3 × 3 neighbourhood of a pixel."""
 MAX_COUNTED = 2**20
 """Largest number of object pixels, evenly drawn from all views, from which statistics are computed."""
 
@@ -77,7 +67,9 @@ class PixelDataset:
         exact: bool = False,
     ) -> None:
         if not views:
-            raise UserError(f"{capture.root}: no views to load", "hold out fewer views, or more")
+            raise UserError(
+                f"{capture.root}: no views to load", "leave views of both kinds, to train on and to test on"
+            )
         self.capture = capture
         self.views = tuple(views)
         self.device = torch.device(device)
@@ -129,25 +121,27 @@ class PixelDataset:
 
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
         """Return all pixels of `views[i]`, row by row, also invalid ones. Image gradients as in `sample`."""
-        rows, camera = self.store.rows(i), self.views[i].camera
-        numbers, colors = np.arange(rows.start, rows.stop), self.store.view_colors(i)
+        indices, camera = self.store.indices(i), self.views[i].camera
+        numbers, colors = np.arange(indices.start, indices.stop), self.store.view_colors(i)
         shape = camera.height, camera.width
-        gradient = _gradient(self._display_luminance(colors).view(shape)).reshape(-1) if gradients else None
+        gradient = (
+            image_gradient(self._display_luminance(colors).view(shape)).reshape(-1) if gradients else None
+        )
         return self._batch(numbers, np.full(len(numbers), i), colors, gradient)
 
-    def at(self, i: int, rows: Int[Tensor, " N"]) -> PixelBatch:
+    def at(self, i: int, pixel: Int[Tensor, " N"]) -> PixelBatch:
         """Return pixels of `views[i]` by their index in the view, without image gradients."""
-        numbers = self.store.rows(i).start + rows.cpu().numpy()
+        numbers = self.store.indices(i).start + pixel.cpu().numpy()
         views = np.full(len(numbers), i)
         return self._batch(numbers, views, self.store.colors(numbers, views), None)
 
     def valid(self, i: int) -> Bool[Tensor, " N"]:
         """Return which pixels of `views[i]` are valid."""
-        return self._bit(self.store.bits[self.store.rows(i)], VALID)
+        return self._bit(self.store.bits[self.store.indices(i)], VALID)
 
     def near(self, i: int) -> Bool[Tensor, " N"]:
         """Return which pixels of `views[i]` are on or near the object; all false if the object is unknown."""
-        return self._bit(self.store.bits[self.store.rows(i)], NEAR)
+        return self._bit(self.store.bits[self.store.indices(i)], NEAR)
 
     def _views_of(self, numbers: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
         return np.searchsorted(self.store.starts, numbers, side="right") - 1
@@ -193,7 +187,7 @@ class PixelDataset:
     def _gradients_at(
         self, numbers: Int[np.ndarray, " N"], views: Int[np.ndarray, " N"]
     ) -> Float32[Tensor, " N"]:
-        """Image gradients at single pixels; see `_scharr`."""
+        """Image gradients at single pixels; see `scharr`."""
         size = np.array([(view.camera.width, view.camera.height) for view in self.views])[views]
         at = numbers - self.store.starts[views]
         column, row, last = at % size[:, 0], at // size[:, 0], size - 1
@@ -201,7 +195,7 @@ class PixelDataset:
         rows = np.clip(row + NEIGHBORS[:, 0, None], 0, last[:, 1])
         around = self.store.starts[views] + rows * size[:, 0] + columns
         colors = self.store.colors(around, np.broadcast_to(views, around.shape))
-        return _scharr(self._display_luminance(colors).unbind(0))
+        return scharr(self._display_luminance(colors).unbind(0))
 
     # --------------------------------------------------------------------------------------------- statistics
 
@@ -235,85 +229,14 @@ class PixelDataset:
         step = -(-len(self) // MAX_COUNTED)
         colors = []
         for i in range(len(self.views)):
-            rows = self.store.rows(i)
-            wanted = VALID | MASK
-            numbers = rows.start + np.flatnonzero((self.store.bits[rows] & wanted) == wanted)[::step]
+            indices, wanted = self.store.indices(i), VALID | MASK
+            chosen = np.flatnonzero((self.store.bits[indices] & wanted) == wanted)[::step]
+            numbers = indices.start + chosen
             colors.append(self.store.colors(numbers, np.full(len(numbers), i)))
             self.store.release()
-        return self._linear(np.concatenate(colors))
+        return self.linear(np.concatenate(colors))
 
-    def border_color(self) -> Float[Tensor, " 3"] | None:
-        """Return the linear RGB of the background, or None if the borders of the images have no common
-        colour.
-
-        The background colour is the median of the border, if at least half of the border pixels differ from
-        it by at most 2 % of the brighter of that colour and the object's median radiance, and if the other
-        border pixels can lie within the scene (`backdrop`), which fails if that colour is the ground and the
-        others are the sky.
-        """
-        numbers, views = border(self.store)
-        color = self.border_median()
-        if not len(numbers):
-            return None
-        tolerance = BORDER_TOLERANCE * max(float(color.max()), self.median_radiance())
-
-        def unlike(colors: Float32[np.ndarray, "N 3"]) -> Bool[Tensor, " N"]:
-            return (self._linear(colors) - color).abs().amax(dim=-1) > tolerance
-
-        others = unlike(self.store.colors(numbers, views)).numpy()
-        if others.sum() > (1 - BORDER_SHARE) * len(numbers):
-            return None
-        return color if self._within_the_scene(numbers[others], views[others], unlike) else None
-
-    def border_median(self) -> Float[Tensor, " 3"]:
-        """Return the median linear RGB of the image borders; black if no pixel there is valid."""
-        colors = self._linear(self.border_colors())
-        return colors.median(dim=0).values if len(colors) else colors.new_zeros(3)
-
-    def border_colors(self) -> Float32[np.ndarray, "B 3"]:
-        """Return the colours of the valid pixels on the image borders."""
-        return self.store.colors(*border(self.store))
-
-    def _within_the_scene(
-        self,
-        numbers: Int[np.ndarray, " N"],
-        views: Int[np.ndarray, " N"],
-        other: Callable[[Float32[np.ndarray, "V 3"]], Bool[Tensor, " V"]],
-    ) -> bool:
-        """Whether the content of these pixels can lie in the scene; `other` selects the other colours."""
-        if not len(numbers):
-            return True
-        step = -(-len(numbers) // MAX_RAYS)
-        number, view = numbers[::step], torch.from_numpy(np.ascontiguousarray(views[::step])).to(self.device)
-        rays = self._rays(view, torch.from_numpy(number - self.store.starts[views[::step]]).to(self.device))
-        outlines = []
-        for i in range(0, len(self.views), -(-len(self.views) // MAX_VIEWS)):
-            inside = other(self.store.view_colors(i)).view(self.views[i].camera.height, -1)
-            outlines.append(Outline(self.views[i], inside.numpy()))
-            self.store.release()
-        return leaves_room(outlines, rays, self.capture.normalization)
-
-    def _linear(self, colors: Float32[np.ndarray, "*shape"]) -> Float32[Tensor, "*shape"]:
+    def linear(self, colors: Float32[np.ndarray, "*shape"]) -> Float32[Tensor, "*shape"]:
+        """Return the linear values of stored colours."""
         color = torch.from_numpy(colors)
         return color if self.capture.hdr else srgb_to_linear(color)
-
-
-def _gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
-    """`_scharr` of a whole image, with replicated borders."""
-    padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
-    height, width = values.shape
-    return _scharr(
-        [padded[1 + row : 1 + row + height, 1 + column : 1 + column + width] for row, column in NEIGHBORS]
-    )
-
-
-def _scharr(about: Sequence[Float32[Tensor, "*shape"]]) -> Float32[Tensor, "*shape"]:
-    """The length of the Scharr gradient from the nine values around each pixel, in the order of `NEIGHBORS`.
-
-    The usual factor of 1/32 is left out, so a ramp of 0.01 per pixel has the value 0.32. The weight of L_smth
-    is the exponential of this value, as in the published code; with the factor, no edge of an image would
-    have an effect.
-    """
-    right = 3 * (about[2] - about[0]) + 10 * (about[5] - about[3]) + 3 * (about[8] - about[6])
-    down = 3 * (about[6] - about[0]) + 10 * (about[7] - about[1]) + 3 * (about[8] - about[2])
-    return torch.hypot(right, down)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.atomic_file import replacing
 
 __all__ = ["CODES_BY_NAME", "NORMAL", "POSITION", "needs_double", "write_ply"]
 

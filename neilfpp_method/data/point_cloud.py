@@ -25,6 +25,7 @@ __all__ = [
 ]
 
 BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": None}
+"""NumPy's sign of the byte order, by the encoding that a header states."""
 HEADER_LIMIT = 65_536
 """Largest number of bytes of the header of a PLY file."""
 
@@ -54,8 +55,7 @@ def read_oriented_ply(path: Path) -> WorldPoints:
 
     Raises:
         UserError: the file is missing, malformed or cut off, has no points or no normals, or contains a
-        number
-            that is not finite or a normal of length 0.
+            number that is not finite or a normal of length 0.
     """
     vertices = _read(path)
     position, normal = _columns(path, vertices, POSITION), _columns(path, vertices, NORMAL)
@@ -71,8 +71,7 @@ def read_oriented_ply(path: Path) -> WorldPoints:
 
 
 def read_positions(path: Path) -> Float64[np.ndarray, "N 3"]:
-    """Read the positions of the vertices of a PLY file, in the world frame, without those that are not
-    finite.
+    """Read the finite positions of the vertices of a PLY file, in the world frame.
 
     Raises:
         UserError: the file is missing, malformed or cut off.
@@ -119,14 +118,21 @@ def _columns(path: Path, vertices: np.ndarray, names: tuple[str, str, str]) -> F
 
 
 def _vertices(data: bytes) -> np.ndarray:
-    """Parse the vertices into a structured array. They must be the first element, as all common programs
-    write them.
+    """Parse the vertices into a structured array.
+
+    They must be the first element, as all common programs write them.
+
+    Raises:
+        ValueError, KeyError or IndexError: the file is malformed or cut off.
     """
     head, separator, _ = data[:HEADER_LIMIT].partition(b"end_header")
     if not separator or not head.startswith(b"ply"):
         raise ValueError("it has no PLY header")
     lines = [line.split() for line in head.decode("ascii").splitlines() if line.split()]
-    order = BYTE_ORDER[next((words[1] for words in lines if words[0] == "format"), "no format")]
+    encoding = next((words[1] for words in lines if words[0] == "format"), "")
+    if encoding not in BYTE_ORDER:
+        raise ValueError(f"its header states no format out of {', '.join(BYTE_ORDER)}")
+    order = BYTE_ORDER[encoding]
     elements = [i for i, words in enumerate(lines) if words[0] == "element"]
     if not elements or lines[elements[0]][1] != "vertex":
         raise ValueError("its first element is not the vertices")

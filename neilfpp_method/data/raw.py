@@ -6,6 +6,7 @@ model have the same white balance. Two images of a scene then differ only by the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float32, UInt16
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["RAW_SUFFIXES", "Developed", "develop"]
+__all__ = ["RAW_SUFFIXES", "Developed", "check_not_raw", "develop"]
 
 RAW_SUFFIXES = (".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 INTERPOLATION_REACH = 5
@@ -58,7 +59,7 @@ def develop(path: Path) -> Developed:
                 highlight_mode=rawpy.HighlightMode.Clip,
                 user_flip=0,
             )
-            saturated = _saturated(raw, samples.shape[:2])
+            saturated = _saturated(path, raw, samples.shape[:2])
             red, green, blue = (float(factor) for factor in raw.camera_whitebalance[:3])
     except UserError:
         raise
@@ -72,6 +73,20 @@ def develop(path: Path) -> Developed:
     return Developed(pixels, ~saturated, balance)
 
 
+def check_not_raw(paths: Sequence[Path]) -> None:
+    """Check that there is no camera RAW among images whose pixels are said to be sRGB values.
+
+    Raises:
+        UserError: there is one; `develop` makes linear radiance of it.
+    """
+    raw = next((path for path in paths if path.suffix.lower() in RAW_SUFFIXES), None)
+    if raw is not None:
+        raise UserError(
+            f"{raw}: camera RAW is developed to linear radiance, not to sRGB values",
+            "leave out the response srgb",
+        )
+
+
 def _rawpy(path: Path) -> ModuleType:
     try:
         import rawpy
@@ -80,13 +95,20 @@ def _rawpy(path: Path) -> ModuleType:
     return rawpy
 
 
-def _saturated(raw, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    """Pixels whose colour comes, wholly or in part, from a sensor pixel at its white level."""
+def _saturated(path: Path, raw, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+    """Pixels whose colour comes, wholly or in part, from a sensor pixel at its white level.
+
+    Args:
+        path: the file, for the message.
+        raw: the file as rawpy opened it.
+        size: height and width of the developed image, in pixels.
+    """
     mosaic = raw.raw_image_visible
     if mosaic.shape[:2] != size:
+        sensor, image = ("×".join(map(str, shape[::-1])) for shape in (mosaic.shape[:2], size))
         raise UserError(
-            f"a sensor of {mosaic.shape[:2]} pixels in a picture of {size}",
-            "develop it to linear EXR yourself",
+            f"{path}: {image} pixels from a sensor of {sensor}, so its saturated pixels are unknown",
+            "develop it with another program, to linear EXR",
         )
     full = (mosaic >= raw.white_level).reshape(*size, -1).any(axis=-1).astype(np.uint8)
     return cv2.dilate(full, np.ones((INTERPOLATION_REACH, INTERPOLATION_REACH), np.uint8)) > 0

@@ -5,11 +5,11 @@ Every file is optional and is read by the method that needs it. Maps of a view a
 does; its depth is that at its centre, and all other values are means over its area. All positions, lengths
 and directions that the methods return are in the scene frame.
 
-    <inputs>/depth_maps/<stem>.exr                    depth along the camera's axis, world units; 0: no
-    surface <inputs>/normal_maps/<stem>.exr                   unit normals, world axes; 0: no surface
-    <inputs>/model/mesh.ply                           the surface, world frame
-    ground_truths/materials/{kd,roughness,metallic}/  <stem>.png, linear, usually only for the test views
-    light/light_field_gt.npz                          incident and outgoing radiance at surface points
+    <inputs>/depth_maps/<stem>.exr     depth along the camera's axis, world units; 0: no surface
+    <inputs>/normal_maps/<stem>.exr    unit normals, world axes; 0: no surface
+    <inputs>/model/mesh.ply            the surface, world frame
+    ground_truths/materials/*/<stem>.png    kd, roughness, metallic; linear, usually only for the test views
+    light/light_field_gt.npz           incident and outgoing radiance at surface points
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
@@ -62,10 +62,13 @@ class Truth:
 
     def depth(self, view: View) -> Float[Tensor, " P"] | None:
         """Return the depth along the camera's axis in scene units, 0 on the background."""
-        pixels = self._pixels(
-            self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1, mean=False
-        )
-        return None if pixels is None else pixels[:, 0] / self.capture.normalization.scale
+        values = self._read(self.capture.inputs / "depth_maps" / f"{view.name}.exr", view, channels=1)
+        if values is None:
+            return None
+        size = (view.camera.width, view.camera.height)
+        covered = area_share((values != 0).any(-1), *size) > 1 - 1e-6
+        depth = np.where(covered, nearest(values, *size)[..., 0], np.float32(0.0))
+        return torch.from_numpy(depth).reshape(-1) / self.capture.normalization.scale
 
     def mask(self, view: View) -> Bool[Tensor, " P"] | None:
         """Return which pixels show a surface, according to the depth map."""
@@ -74,16 +77,14 @@ class Truth:
 
     def normal(self, view: View) -> Float[Tensor, "P 3"] | None:
         """Return unit normals, 0 on the background. World frame and scene frame have the same axes."""
-        pixels = self._pixels(self.capture.inputs / "normal_maps" / f"{view.name}.exr", view, channels=3)
+        pixels = self._mean(self.capture.inputs / "normal_maps" / f"{view.name}.exr", view, channels=3)
         return None if pixels is None else torch.nn.functional.normalize(pixels, dim=-1)
 
     def material(self, view: View) -> Material | None:
-        """Return base colour, roughness and metallic, 0 on the background; None if one of the maps is
-        missing.
-        """
+        """Return base colour, roughness and metallic, 0 on the background; None if a map is missing."""
         folder = self.capture.root / "ground_truths" / "materials"
         base_color, roughness, metallic = (
-            self._pixels(folder / name / f"{view.name}.png", view, channels)
+            self._mean(folder / name / f"{view.name}.png", view, channels)
             for name, channels in (("kd", 3), ("roughness", 1), ("metallic", 1))
         )
         if base_color is None or roughness is None or metallic is None:
@@ -101,9 +102,9 @@ class Truth:
         if path is None:
             return None
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                get = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in arrays.files}
-            (n, s, _), (_, k, _) = get["wi"].shape, get["wo"].shape
+            with np.load(path, allow_pickle=False) as stored:
+                arrays = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored.files}
+            (n, s, _), (_, k, _) = arrays["wi"].shape, arrays["wo"].shape
             shapes = {
                 "points": (n, 3),
                 "normals": (n, 3),
@@ -113,30 +114,38 @@ class Truth:
             }
             shapes |= {"wi": (n, s, 3), "incident": (n, s, 3), "wo": (n, k, 3), "outgoing": (n, k, 3)}
             for name, shape in shapes.items():
-                if get[name].shape != shape:
-                    raise ValueError(f"{name} has the shape {tuple(get[name].shape)}, not {shape}")
+                if arrays[name].shape != shape:
+                    raise ValueError(f"{name} has the shape {tuple(arrays[name].shape)}, not {shape}")
         except Exception as error:
             # For a damaged archive, zipfile, zlib and numpy raise many types of exceptions.
             raise UserError(
                 f"{path}: not a light field ({error})", "remove the file, or write it again"
             ) from error
         return LightField(
-            position=self.capture.normalization.to_scene(get["points"]),
-            normal=get["normals"],
-            material=Material(get["base_color"], get["roughness"][:, None], get["metallic"][:, None]),
-            wi=get["wi"],
-            incident=get["incident"],
-            wo=get["wo"],
-            outgoing=get["outgoing"],
+            position=self.capture.normalization.to_scene(arrays["points"]),
+            normal=arrays["normals"],
+            material=Material(
+                arrays["base_color"], arrays["roughness"][:, None], arrays["metallic"][:, None]
+            ),
+            wi=arrays["wi"],
+            incident=arrays["incident"],
+            wo=arrays["wo"],
+            outgoing=arrays["outgoing"],
         )
 
     def _file(self, path: Path) -> Path | None:
         return path if inside(self.capture.root, path).is_file() else None
 
-    def _pixels(
-        self, path: Path, view: View, channels: int, mean: bool = True
-    ) -> Float[Tensor, "P C"] | None:
-        """Read the pixels of a file, row by row; `mean` selects the mean over the area of a reduced pixel."""
+    def _mean(self, path: Path, view: View, channels: int) -> Float[Tensor, "P C"] | None:
+        """The means of a file over the areas of the pixels of a view, row by row."""
+        values = self._read(path, view, channels)
+        if values is None:
+            return None
+        mean = area_average(values, view.camera.width, view.camera.height)
+        return torch.from_numpy(mean).reshape(-1, channels)
+
+    def _read(self, path: Path, view: View, channels: int) -> Float32[np.ndarray, "H W C"] | None:
+        """The pixels of a file, which must have the size of the files of the view."""
         if self._file(path) is None:
             return None
         pixels = read_image(path).pixels
@@ -150,12 +159,4 @@ class Truth:
             )
         if not np.isfinite(pixels).all():
             raise UserError(f"{path}: a pixel is not finite", "render it again")
-        size = (view.camera.width, view.camera.height)
-        if size != file_size(view):
-            covered = (
-                area_share((pixels != 0).any(-1), *size) > 1 - 1e-6 if not mean else np.ones(size[::-1], bool)
-            )
-            pixels = np.where(
-                covered[..., None], (area_average if mean else nearest)(pixels, *size), np.float32(0.0)
-            )
-        return torch.from_numpy(pixels).reshape(-1, channels)
+        return pixels

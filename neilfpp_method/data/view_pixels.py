@@ -18,7 +18,7 @@ from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 
 __all__ = ["ViewPixels", "pixel_colors", "read_colors", "read_mask", "read_view"]
 
-HALF = 0.5
+MIN_OBJECT_SHARE = 0.5
 """Smallest share of the area of a reduced pixel that must be on the object."""
 ROWS = 256
 """Number of rows of an image that are converted to linear values at once; bounds the memory."""
@@ -60,7 +60,7 @@ def read_view(view: View, hdr: bool) -> ViewPixels:
     width, height = view.camera.width, view.camera.height
     if file_size(view) != (width, height):
         color = _scaled(color, hdr, width, height)
-        mask = None if mask is None else area_share(mask, width, height) >= HALF
+        mask = None if mask is None else area_share(mask, width, height) >= MIN_OBJECT_SHARE
         usable = area_share(usable, width, height) > 1 - 1e-6
     return ViewPixels(color, mask, usable, broken)
 

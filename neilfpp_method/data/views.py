@@ -246,8 +246,11 @@ def plain_name(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Projection:
-    """Image points, in pixels with centres at +½, and depths along the camera's axis, in the unit of its
-    pose.
+    """Image points and depths.
+
+    Attributes:
+        pixel: image points (column, row), in pixels, with the centres of pixels at +½.
+        depth: depth along the camera's axis, in the unit of its pose.
     """
 
     pixel: Float[Tensor, "N 2"]
@@ -369,9 +372,7 @@ def _shape(camera: Camera) -> Hashable:
 
 
 def _whole_plane(camera: Camera, dtype: torch.dtype) -> Float[np.ndarray, "P 2"]:
-    """`_straight_plane` of all pixels of a camera, in the precision of rays; computed in parts to bound
-    memory.
-    """
+    """`_straight_plane` of all pixels of a camera, in the precision of rays; in parts to bound memory."""
     count = camera.width * camera.height
     parts = np.split(np.arange(count), range(PLANE_PART, count, PLANE_PART))
     plane = np.concatenate(

@@ -1,0 +1,1 @@
+"""The example capture of the package, and the command that trains on it."""

@@ -20,7 +20,7 @@ from jaxtyping import Float, Float32, Int32
 from torch import Tensor
 
 from neilfpp_method import __version__
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.extract import extract_mesh
 from neilfpp_method.hosts.base import HasSdf, SmoothsNormals

@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.text import Text
 
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import replacing, write_png
+from neilfpp_method.data.images import write_png
 from neilfpp_method.errors import EarlyEnd
 from neilfpp_method.inspection.defects import Inspection, inspect_capture
 from neilfpp_method.inspection.measure import ObjectSource
@@ -26,6 +27,7 @@ STYLES = {
     "limited": "bold yellow",
     "poor": "bold red",
 }
+"""Style of a word on the console: the severity of a defect, or the level of the radiance."""
 
 
 def run_inspection(
@@ -81,7 +83,6 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
         "broken",
         "pixels",
         "levels",
-        "object_from",
     )
     return {
         "capture": {

@@ -21,6 +21,7 @@ from neilfpp_method.inspection.relations import (
 )
 
 __all__ = [
+    "MIN_COUNT",
     "Defect",
     "Inspection",
     "inspect_capture",
@@ -146,22 +147,21 @@ def _lines_of_problems(defects: Sequence[Defect]) -> tuple[str, ...]:
 
 
 def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
-    """Return the views that should be left out: black ones, blurred ones, and duplicates.
+    """Return the views that a better capture would not have: black ones, blurred ones, and duplicates.
 
     Returns:
-        The reason by the name of the view; empty if too few views would remain.
+        The reason by the name of the view. With fewer than `MIN_COUNT` other views, none can be left out.
 
     Example:
         >>> views_to_leave_out(inspect_capture(load_capture("captures/teapot")))
         {'IMG_0017': 'blurred'}
     """
-    proposed = {
+    return {
         name: REMOVABLE[defect.kind]
         for defect in inspection.defects
         if defect.kind in REMOVABLE
         for name in defect.views
     }
-    return proposed if len(inspection.views) - len(proposed) >= MIN_COUNT else {}
 
 
 def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Defect]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -11,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float32
 
 from neilfpp_method.data.images import ImageFile, read_image
+from neilfpp_method.data.pixel_store import BORDER_SHARE
 from neilfpp_method.data.view_pixels import pixel_colors
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
@@ -24,8 +26,6 @@ SHARPNESS_SIDE = 1600
 """Longest side at which sharpness is measured, in pixels; finer detail is blurred by demosaicing."""
 MIDDLE_GRAY = 0.18
 """Linear value to which the luminance of the object is scaled before sharpness is measured."""
-BORDER_SHARE = 0.5
-"""Smallest share of border pixels of one colour with which that colour is the background."""
 DARK = 1e-3
 """Luminance below which a pixel counts as black, relative to the mean of the object."""
 FULL = 254.5 / 255
@@ -39,6 +39,7 @@ LEVEL_SAMPLES = 200_000
 
 
 ObjectSource = Literal["mask file", "alpha channel", "background of one colour", "nothing"]
+"""What shows which pixels of a view are on the object."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,8 @@ def measure(view: View, hdr: bool) -> ViewFigures:
     try:
         image = read_image(view.image)
         color = pixel_colors(view, image, hdr).numpy()
-        valid = _mask(view, "valid", color.shape[:2])
-        mask = _mask(view, "mask", color.shape[:2]) if view.mask else None
+        valid = np.ones(color.shape[:2], bool) if view.valid is None else _mask(view.valid, view, color)
+        mask = None if view.mask is None else _mask(view.mask, view, color)
     except UserError as error:
         return ViewFigures(view.name, unreadable=error.problem)
     sound = (np.isfinite(color) & (color >= 0)).all(axis=-1)
@@ -124,12 +125,10 @@ def measure(view: View, hdr: bool) -> ViewFigures:
     )
 
 
-def _mask(view: View, kind: str, size: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
-    path = getattr(view, kind)
-    if path is None:
-        return np.ones(size, bool)
+def _mask(path: Path, view: View, color: Float32[np.ndarray, "H W 3"]) -> Bool[np.ndarray, "H W"]:
+    """Where a mask file of a view is white."""
     values = read_image(path).mask
-    if values.shape != size:
+    if values.shape != color.shape[:2]:
         raise UserError(f"{path}: another size than {view.image}", "make the mask again")
     return values > 0.5
 

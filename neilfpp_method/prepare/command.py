@@ -20,6 +20,7 @@ from neilfpp_method.data.bracket_folder import Brackets
 from neilfpp_method.data.capture import READERS, Capture, load_capture
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
+from neilfpp_method.data.split import check_test_every
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.prepare.background import sigterm_as_ctrl_c, silent
 from neilfpp_method.prepare.layout import WORK, PoseSource, lay_out
@@ -32,10 +33,13 @@ from neilfpp_method.prepare.photos import Photos, survey, unreadable
 from neilfpp_method.prepare.posed import posed_by_capture, posed_by_model
 from neilfpp_method.prepare.progress import Bars, bars
 from neilfpp_method.prepare.sparse_cloud import sparse_points
-from neilfpp_method.prepare.steps import begin, stamp
+from neilfpp_method.prepare.steps import Step, begin, stamp
 from neilfpp_method.prepare.summary import describe_cameras, placements, remarks_on
 
 __all__ = ["run_prepare"]
+
+DATABASE = "database.db"
+"""COLMAP's database of features and matches, in the folder of the step that matches."""
 
 
 def run_prepare(options: Prepare, console: Console) -> Path:
@@ -51,6 +55,7 @@ def run_prepare(options: Prepare, console: Console) -> Path:
         UserError: the input is bad, or the images cannot be placed in one scene.
         Stopped: the command was interrupted; the message names the command that continues.
     """
+    check_test_every(options.test_every)
     _check_place(options)
     silent()
     with _stop_with_command(options):
@@ -97,11 +102,6 @@ def _check_place(options: Prepare) -> None:
         raise UserError(
             f"{options.out}: not empty, and not written by neilfpp prepare", "choose another --out"
         )
-    if options.test_every is not None and (options.test_every < 0 or options.test_every == 1):
-        raise UserError(
-            f"every {options.test_every}-th view cannot be held out",
-            "give 2 or more, or 0 to hold out no view",
-        )
 
 
 @contextmanager
@@ -111,17 +111,23 @@ def _stop_with_command(options: Prepare) -> Iterator[None]:
         with sigterm_as_ctrl_c():
             yield
     except KeyboardInterrupt:
-        arguments = [str(options.images), "--out", str(options.out)]
-        for field in fields(options)[2:]:
-            value = getattr(options, field.name)
-            name = field.name.replace("_", "-")
-            if isinstance(value, bool) and value != field.default:
-                arguments.append(f"--{name}" if value else f"--no-{name}")
-            elif value != field.default:
-                arguments += [f"--{name}", *map(str, value if isinstance(value, tuple) else [value])]
         raise Stopped(
-            "stopped; finished steps are kept", f"continue with: neilfpp prepare {shlex.join(arguments)}"
+            "stopped; finished steps are kept", f"continue with: {_command_line(options)}"
         ) from None
+
+
+def _command_line(options: Prepare) -> str:
+    """The command with these options, without those that have their default."""
+    words = ["neilfpp", "prepare", str(options.images)]
+    for field in fields(options):
+        value, name = getattr(options, field.name), field.name.replace("_", "-")
+        if field.name == "images" or value == field.default:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{name}" if value else f"--no-{name}")
+        else:
+            words += [f"--{name}", *map(str, value if isinstance(value, tuple) else [value])]
+    return shlex.join(words)
 
 
 # ---------------------------------------------------------------------------------------------------- sources
@@ -152,40 +158,67 @@ def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, op
     work = options.out / WORK
     merged = merge_photos(photos, brackets, options.response, work / "merged", open_bar) if brackets else None
     photos = merged.photos if merged else photos
-    files = stamp([photo.path for photo in photos.items], photos.root)
-    step = begin(work / "copies", merged and merged.step, photos=files, linear=photos.linear)
-    copies = step.folder
-    if step.result is None:
-        broken = write_copies(photos, copies, open_bar("copies for matching", len(photos.items)).advance)
-        _check_readable(broken, options)
-        step = replace(step, result=step.complete({"unreadable": broken}))
-    problems = (*photos.unreadable.values(), *step.result["unreadable"])
+    copied = _copy(photos, merged and merged.step, options, open_bar)
+    problems = (*photos.unreadable.values(), *copied.result["unreadable"])
     _check_readable(problems, options)
-    photos = replace(photos, items=tuple(p for p in photos.items if (copies / f"{p.name}.png").is_file()))
+    readable = tuple(photo for photo in photos.items if (copied.folder / f"{photo.name}.png").is_file())
+    photos = replace(photos, items=readable)
+    matched = _match(photos, copied, options, open_bar)
+    mapped = _map(photos, copied, matched, options, open_bar)
 
-    count = len(photos.items)
-    pairing = choose_pairing(options.matching, count)
-    step = begin(work / "matches", step, cameras=options.cameras, model=options.camera_model, pairing=pairing)
-    database = step.folder / "database.db"
-    if step.result is None:
-        bar = open_bar("finding features", count)
-        extract_features(database, copies, photos.items, options.cameras, options.camera_model, bar.to)
-        match_features(database, pairing, step.folder, open_bar("matching pairs", 1).to)
-        step = replace(step, result=step.complete({"features": feature_counts(database)}))
-    features = step.result["features"]
-
-    step = begin(work / "model", step)
-    if step.result is None:
-        mapped = map_scene(database, copies, step.folder, photos.items, open_bar("placing cameras", count).to)
-        step = replace(step, result=step.complete({"sizes": mapped}))
-    model = open_model(step.folder / "largest")
-    placed = placements(features, model)
-    sizes = tuple(step.result["sizes"])
+    model = open_model(mapped.folder / "largest")
+    placed = placements(matched.result["features"], model)
+    sizes = tuple(mapped.result["sizes"])
     if not options.allow_partial:
         refuse_partial([p.name for p in placed if p.points is None], sizes)
     cameras = describe_cameras(model)
-    remarks = [f"left out: {problem}" for problem in problems] + remarks_on(placed, sizes, cameras)
-    remarks = (*([merged.remark] if merged else []), *remarks)
-    return PoseSource(
-        posed_by_model(photos, model), step, sparse_points(model), placed, sizes, cameras, remarks
+    remarks = (
+        *([merged.remark] if merged else []),
+        *(f"left out: {problem}" for problem in problems),
+        *remarks_on(placed, sizes, cameras),
     )
+    return PoseSource(
+        posed_by_model(photos, model), mapped, sparse_points(model), placed, sizes, cameras, remarks
+    )
+
+
+def _copy(photos: Photos, after: Step | None, options: Prepare, open_bar: Bars) -> Step:
+    """The step that writes 8-bit copies for matching; its result names the photographs without one."""
+    files = stamp([photo.path for photo in photos.items], photos.root)
+    step = begin(options.out / WORK / "copies", after, photos=files, linear=photos.linear)
+    if step.result is not None:
+        return step
+    broken = write_copies(photos, step.folder, open_bar("copies for matching", len(photos.items)).advance)
+    # The step stays open if the command ends here, so that repaired photographs are copied the next time.
+    _check_readable(broken, options)
+    return step.complete({"unreadable": broken})
+
+
+def _match(photos: Photos, copied: Step, options: Prepare, open_bar: Bars) -> Step:
+    """The step that finds and matches features; its result has the number of features of each photograph."""
+    count = len(photos.items)
+    pairing = choose_pairing(options.matching, count)
+    step = begin(
+        options.out / WORK / "matches",
+        copied,
+        cameras=options.cameras,
+        model=options.camera_model,
+        pairing=pairing,
+    )
+    if step.result is not None:
+        return step
+    database = step.folder / DATABASE
+    bar = open_bar("finding features", count)
+    extract_features(database, copied.folder, photos.items, options.cameras, options.camera_model, bar.to)
+    match_features(database, pairing, step.folder, open_bar("matching pairs", 1).to)
+    return step.complete({"features": feature_counts(database)})
+
+
+def _map(photos: Photos, copied: Step, matched: Step, options: Prepare, open_bar: Bars) -> Step:
+    """The step that estimates poses and points; its result has the number of images of each model."""
+    step = begin(options.out / WORK / "model", matched)
+    if step.result is not None:
+        return step
+    progress = open_bar("placing cameras", len(photos.items)).to
+    database = matched.folder / DATABASE
+    return step.complete({"sizes": map_scene(database, copied.folder, step.folder, photos.items, progress)})

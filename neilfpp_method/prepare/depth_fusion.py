@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.data.views import Camera
@@ -93,8 +93,8 @@ class _Surface:
         agrees: whether the depth map has the depth of the point.
     """
 
-    row: np.ndarray
-    column: np.ndarray
+    row: Int64[np.ndarray, " N"]
+    column: Int64[np.ndarray, " N"]
     position: Float64[np.ndarray, "N 3"]
     normal: Float64[np.ndarray, "N 3"]
     agrees: Bool[np.ndarray, " N"]
@@ -103,11 +103,14 @@ class _Surface:
 def _lookup(
     camera: Camera, depth_map: OrientedDepth, position: Float64[np.ndarray, "N 3"], step: float
 ) -> _Surface:
-    row, column, expected = _project(camera, position)
-    depth = depth_map.depth[row, column].astype(np.float64)
-    normal = depth_map.normal[row, column].astype(np.float64)
+    at = _project(camera, position)
+    depth = depth_map.depth[at.row, at.column].astype(np.float64)
     return _Surface(
-        row, column, _unproject(camera, row, column, depth), normal, _agree(depth, expected, step)
+        row=at.row,
+        column=at.column,
+        position=_unproject(camera, at.row, at.column, depth),
+        normal=depth_map.normal[at.row, at.column].astype(np.float64),
+        agrees=_agree(depth, at.depth, step),
     )
 
 
@@ -130,22 +133,33 @@ def _count_confirmations(
     position = _unproject(cameras[i], rows, columns, depths[i][rows, columns])
     count = np.zeros(depths[i].shape, np.float32)
     for j in others:
-        row, column, expected = _project(cameras[j], position)
-        count[rows, columns] += _agree(depths[j][row, column].astype(np.float64), expected, step)
+        at = _project(cameras[j], position)
+        depth = depths[j][at.row, at.column].astype(np.float64)
+        count[rows, columns] += _agree(depth, at.depth, step)
     return count
 
 
-def _project(
-    camera: Camera, position: Float64[np.ndarray, "N 3"]
-) -> tuple[np.ndarray, np.ndarray, Float64[np.ndarray, " N"]]:
-    """Row, column and depth of points in a view. Outside of its image they are 0, 0 and −1."""
+@dataclass(frozen=True)
+class _Projected:
+    """Points in a view: row and column of their pixels, and their depths along the optical axis.
+
+    Outside of the image they are 0, 0 and −1.
+    """
+
+    row: Int64[np.ndarray, " N"]
+    column: Int64[np.ndarray, " N"]
+    depth: Float64[np.ndarray, " N"]
+
+
+def _project(camera: Camera, position: Float64[np.ndarray, "N 3"]) -> _Projected:
+    """Project points of the world frame into a view."""
     local = position @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
     depth = local[:, 2]
     plane = local[:, :2] / np.where(depth > 0, depth, 1.0)[:, None]
     pixel = plane * camera.intrinsics[:2] + camera.intrinsics[2:]
     inside = (depth > 0) & (pixel >= 0).all(axis=1) & (pixel < [camera.width, camera.height]).all(axis=1)
     column, row = np.where(inside[:, None], pixel, 0.0).astype(np.int64).T
-    return row, column, np.where(inside, depth, -1.0)
+    return _Projected(row, column, np.where(inside, depth, -1.0))
 
 
 def _unproject(

@@ -18,9 +18,10 @@ from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
 from neilfpp_method.data.scene_box import SceneBox, find_box
+from neilfpp_method.data.split import every_kth
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
-from neilfpp_method.inspection.defects import inspect_capture, problems, views_to_leave_out
+from neilfpp_method.inspection.defects import MIN_COUNT, inspect_capture, problems, views_to_leave_out
 from neilfpp_method.prepare.dense_cloud import dense_cloud
 from neilfpp_method.prepare.options import Prepare
 from neilfpp_method.prepare.pictures import write_picture
@@ -40,9 +41,6 @@ CLOUD = "points.ply"
 
 IMAGE_FOLDERS = ("images", "masks", "valid")
 """Folders of a capture that this module writes, and empties first."""
-
-TEST_EVERY = 8
-"""Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
 
 WRITERS = {"nerfstudio": write_transforms, "neilf": write_sfm_scene}
 """Writers of other layouts, by the value of `--also`."""
@@ -106,12 +104,15 @@ def lay_out(source: PoseSource, options: Prepare, open_bar: Bars) -> Summary | N
     bar = open_bar("inspecting", len(prepared.views))
     inspection = inspect_capture(prepared, lambda _: bar.advance())
     rejected = views_to_leave_out(inspection) if options.auto else {}
-    if rejected:
-        kept = tuple(view for view in prepared.views if view.name not in rejected)
+    kept = tuple(view for view in prepared.views if view.name not in rejected)
+    if len(kept) < MIN_COUNT and rejected:
+        named = ", ".join(rejected)
+        remarks = [f"no view is left out: fewer than {MIN_COUNT} would remain without {named}"]
+    else:
+        remarks = [f"left out: {name}, {reason}" for name, reason in rejected.items()]
         prepared = replace(prepared, views=kept)
-        inspection = inspect_capture(prepared)
-        remarks = (*source.remarks, *(f"left out: {name}, {reason}" for name, reason in rejected.items()))
-        source = replace(source, remarks=remarks)
+        inspection = inspect_capture(prepared) if rejected else inspection
+    source = replace(source, remarks=(*source.remarks, *remarks))
     cloud = _cloud(source, prepared, options, step, open_bar)
     summary = _publish(source, prepared, cloud, problems(inspection), options)
     last.complete({})
@@ -213,6 +214,6 @@ def _relocate(view: View, old: Path, new: Path) -> View:
 
 def _test_views(posed: Posed, views: tuple[View, ...], test_every: int | None) -> frozenset[str]:
     if test_every is None and posed.test is not None:
-        return posed.test
-    every = TEST_EVERY if test_every is None else test_every
-    return frozenset(view.name for view in views[every - 1 :: every]) if every else frozenset()
+        # A test view of the capture may have been left out.
+        return posed.test & {view.name for view in views}
+    return every_kth(views, test_every)

@@ -14,13 +14,21 @@ from typing import Literal
 
 import numpy as np
 
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.images import image_header
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.background import in_background
 from neilfpp_method.prepare.photos import Photo
 
-__all__ = ["Pairing", "choose_pairing", "extract_features", "feature_counts", "match_features"]
+__all__ = [
+    "Pairing",
+    "choose_pairing",
+    "extract_features",
+    "feature_counts",
+    "match_features",
+    "train_vocabulary",
+]
 
 Pairing = Literal["exhaustive", "sequential", "vocabulary"]
 """Which pairs of images are matched: all, neighbours in the order of the names, or similar images."""
@@ -43,6 +51,9 @@ FEATURES_PER_WORD = 8
 
 TRAINING_FEATURES = 200_000
 """Number of features, evenly drawn from all images, from which the vocabulary is trained."""
+
+EMBEDDED_DIMENSIONS = 64
+"""Number of bits of the Hamming embedding of a feature in the vocabulary; COLMAP's default."""
 
 DEFAULT_FOCAL = 1.2
 """Initial focal length without EXIF, in units of the longer side of the image: a field of view of 45°. It is
@@ -201,24 +212,38 @@ def _sequential() -> pycolmap.SequentialPairingOptions:
 
 
 def _vocabulary(database: Path, path: Path) -> pycolmap.VocabTreePairingOptions:
-    """Options with a vocabulary trained on the features of this capture, so that nothing is downloaded."""
+    """Options with a vocabulary of this capture, which is trained if the file does not exist."""
     if not path.is_file():
-        with closing(pycolmap.Database.open(database)) as opened:
-            tables = [opened.read_descriptors(image.image_id) for image in opened.read_all_images()]
-        per_image = max(1, TRAINING_FEATURES // len(tables))
-        samples = tables[0]
-        samples.data = np.concatenate([_every_nth(table.data, per_image) for table in tables])
-        options = pycolmap.VisualIndex.BuildOptions()
-        options.num_visual_words = min(MAX_WORDS, max(1, len(samples.data) // FEATURES_PER_WORD))
-        index = pycolmap.VisualIndex.create(samples.data.shape[1], 64)
-        index.build(options, samples.to_float())
-        index.write(path)
+        train_vocabulary(database, path)
     options = pycolmap.VocabTreePairingOptions()
     options.num_images = SIMILAR_IMAGES
     options.vocab_tree_path = path
     return options
 
 
-def _every_nth(rows: np.ndarray, count: int) -> np.ndarray:
+def train_vocabulary(database: Path, path: Path) -> None:
+    """Train a vocabulary on the features of a capture, so that nothing is downloaded.
+
+    Args:
+        database: COLMAP's database with the features of all images.
+        path: the file of the vocabulary; it is written when it is complete.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    with closing(pycolmap.Database.open(database)) as opened:
+        tables = [opened.read_descriptors(image.image_id) for image in opened.read_all_images()]
+    per_image = max(1, TRAINING_FEATURES // len(tables))
+    samples = tables[0]
+    samples.data = np.concatenate([_evenly_spaced(table.data, per_image) for table in tables])
+    options = pycolmap.VisualIndex.BuildOptions()
+    options.num_visual_words = min(MAX_WORDS, max(1, len(samples.data) // FEATURES_PER_WORD))
+    index = pycolmap.VisualIndex.create(samples.data.shape[1], EMBEDDED_DIMENSIONS)
+    index.build(options, samples.to_float())
+    with replacing(path) as temporary:
+        index.write(temporary)
+
+
+def _evenly_spaced(rows: np.ndarray, count: int) -> np.ndarray:
     """At most `count` rows, evenly spaced."""
     return rows[:: max(1, -(-len(rows) // count))]

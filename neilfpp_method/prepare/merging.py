@@ -125,7 +125,7 @@ def merge_photos(
     step = begin(folder, photos=stamp(used, photos.root), brackets=exposures, response=response)
     if step.result is None:
         moved = _merge(brackets, folder, response, open_bar("merging brackets", len(brackets)))
-        step = replace(step, result=step.complete({"moved": moved}))
+        step = step.complete({"moved": moved})
     by_path = {photo.path: photo for photo in photos.items}
     items = []
     for name, bracket in brackets.items():

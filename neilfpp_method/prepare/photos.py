@@ -15,7 +15,7 @@ from PIL import Image
 from neilfpp_method.data.formats.places import view_names
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header, read_image
 from neilfpp_method.data.photo_exposure import photo_exposure
-from neilfpp_method.data.raw import RAW_SUFFIXES, develop
+from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
 from neilfpp_method.data.views import plain_name
 from neilfpp_method.errors import UserError
 
@@ -115,8 +115,8 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
         response: meaning of pixel values; "auto": floating-point and RAW files are linear.
 
     Raises:
-        UserError: the folder does not exist, has too few images, has images of the same name, or has both
-            linear images and images with display values.
+        UserError: the folder does not exist, has too few images, has images of the same name, has both linear
+            images and images with display values, or has camera RAW whose response is given as sRGB.
     """
     if not root.is_dir():
         problem = "is a file, not a folder" if root.exists() else "no such folder"
@@ -140,6 +140,8 @@ def survey(root: Path, response: Literal["auto", "linear", "srgb"]) -> Photos:
     if response == "auto" and len(set(is_linear.values())) > 1:
         hdr, ldr = (next(path for path in is_linear if is_linear[path] is kind) for kind in (True, False))
         raise UserError(f"{hdr} is linear and {ldr} is not", "keep images of one kind, or give --response")
+    if response == "srgb":
+        check_not_raw(list(is_linear))
     linear = next(iter(is_linear.values())) if response == "auto" else response == "linear"
     names = view_names([path.relative_to(root).as_posix() for path in is_linear])
     check_names(names, tuple(is_linear))

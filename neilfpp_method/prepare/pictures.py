@@ -65,8 +65,7 @@ def write_picture(
 def draw_scene(
     views: Sequence[View], test: Collection[str], points: WorldPoints, box: Normalization
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw cameras as pyramids, points coloured by their normals, and the scene's sphere, from above and the
-    side.
+    """Draw cameras as pyramids, points coloured by their normals, and the scene's sphere, from two sides.
 
     Args:
         views: views in the world frame, whose +z is drawn upwards.

@@ -79,8 +79,7 @@ class GrayView:
 
 
 def gray_view(view: View, linear: bool) -> GrayView:
-    """Read the image of a view, remove its lens distortion and scale it down to at most `MAX_SIDE` pixels a
-    side.
+    """Read the image of a view for stereo: grey, without lens distortion, at most `MAX_SIDE` pixels a side.
 
     Exposure and white balance are not corrected, because the correlation of two windows does not depend on
     brightness and contrast.

@@ -12,11 +12,11 @@ import json
 import os
 import shutil
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.atomic_file import replacing
 
 __all__ = ["Step", "begin", "stamp"]
 
@@ -41,10 +41,10 @@ class Step:
     inputs: str
     result: dict[str, Any] | None
 
-    def complete(self, result: dict[str, Any]) -> dict[str, Any]:
-        """Mark the step as complete and return the result."""
+    def complete(self, result: dict[str, Any]) -> Step:
+        """Mark the step as complete; return it with its result."""
         _mark(self.folder, self.inputs, result)
-        return result
+        return replace(self, result=result)
 
 
 def begin(folder: Path, after: Step | None = None, **inputs: Any) -> Step:

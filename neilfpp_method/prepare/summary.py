@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from neilfpp_method.data.capture import FOUND
+from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.capture import BOX_SOURCES
 from neilfpp_method.data.colmap_library import pycolmap
-from neilfpp_method.data.images import replacing
 from neilfpp_method.data.views import SceneSource
 
 __all__ = ["Placement", "Summary", "describe_cameras", "placements", "remarks_on", "write_summary"]
@@ -91,7 +91,7 @@ class Summary:
             for camera in self.cameras
         ]
         lines.append(f"point cloud: {self.points} points with normals ({self.cloud})")
-        lines.append(f"radius of the scene: {self.radius:.4g}{FOUND[self.scene_from]}")
+        lines.append(f"radius of the scene: {self.radius:.4g}{BOX_SOURCES[self.scene_from]}")
         return [*lines, *(f"note: {remark}" for remark in self.remarks), *self.problems]
 
 

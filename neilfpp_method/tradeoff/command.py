@@ -12,13 +12,13 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult, RunResult, frontier
-from neilfpp_method.tradeoff.rows import (
+from neilfpp_method.tradeoff.planned_runs import (
     PlannedRun,
     TradeoffRequest,
     check_same,
+    make_run,
     measured,
-    rows_of,
-    run_row,
+    plan_runs,
 )
 from neilfpp_method.train.output import check_folder
 
@@ -46,36 +46,36 @@ def run_tradeoff(
             settings, or if no run could be finished.
         Stopped: if the user stops the command; the next call continues it.
     """
-    out, rows = request.out, rows_of(request)
+    out, runs = request.out, plan_runs(request)
     # Errors in the capture are raised before anything is written.
     load_capture(request.data)
     check_folder(out)
-    for row in rows:
-        check_same(row)
+    for run in runs:
+        check_same(run)
     left_out: dict[str, str] = {}
-    for number, row in enumerate(rows, start=1):
-        console.print(f"run {number} of {len(rows)}: {row.name}", soft_wrap=True)
+    for number, run in enumerate(runs, start=1):
+        console.print(f"run {number} of {len(runs)}: {run.name}", soft_wrap=True)
         try:
-            run_row(row, console, at_end)
+            make_run(run, console, at_end)
         except UserError as error:
-            left_out[row.name] = str(error)
+            left_out[run.name] = str(error)
             console.print(f"left out: {error}", style="yellow", soft_wrap=True)
             continue
         title = f"{request.data.resolve().name}, {request.config.preset}"
-        write_tradeoff(out, title, finished_runs(rows, left_out))
-    runs = finished_runs(rows, left_out)
-    if not runs:
+        write_tradeoff(out, title, finished_runs(runs, left_out))
+    finished = finished_runs(runs, left_out)
+    if not finished:
         raise UserError(f"{out}: no run could be made", list(left_out.values())[-1])
-    points = frontier(runs)
+    points = frontier(finished)
     for line in frontier_table(points):
         console.print(line, soft_wrap=True)
     console.print(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg", soft_wrap=True)
     return points
 
 
-def finished_runs(rows: Sequence[PlannedRun], left_out: Collection[str]) -> list[RunResult]:
+def finished_runs(runs: Sequence[PlannedRun], left_out: Collection[str]) -> list[RunResult]:
     """The results of the finished runs, without those of the given names."""
-    results = (measured(row) for row in rows if row.name not in left_out)
+    results = (measured(run) for run in runs if run.name not in left_out)
     return [result for result in results if result is not None]
 
 

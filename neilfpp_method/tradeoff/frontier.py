@@ -60,7 +60,7 @@ class BudgetResult:
         figures: means over its runs, for metrics that all runs have.
         deviations: standard deviations over its runs; empty if there is only one run.
         per_minute: change of each metric from the next smaller budget, per minute of additional time; empty
-            for the smallest budget.
+            for the smallest budget, and if the runs took no longer than those of the next smaller one.
         dominated: whether another budget whose runs took no longer is at least as good in every metric and
             better in one.
     """
@@ -75,7 +75,12 @@ class BudgetResult:
 
 
 def frontier(runs: Sequence[RunResult]) -> list[BudgetResult]:
-    """The points of a frontier, by budget."""
+    """The points of a frontier, by budget.
+
+    >>> runs = [RunResult(60.0, 0, 60.0, {"pbr_psnr": 20.0}), RunResult(180.0, 0, 180.0, {"pbr_psnr": 26.0})]
+    >>> [point.per_minute for point in frontier(runs)]
+    [{}, {'pbr_psnr': 3.0}]
+    """
     common = set(FIGURES).intersection(*(run.figures for run in runs)) if runs else set()
     names = [name for name in FIGURES if name in common]
     by_budget: dict[float, list[RunResult]] = {}

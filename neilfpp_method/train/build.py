@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neilfpp_method.data.backdrop import border_color, border_median
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
@@ -77,9 +78,9 @@ def scene_facts(
     scale = ldr if response == "srgb" else hdr
     kind, color = config.background.kind, config.background.color
     if kind == "auto":
-        kind = "inverted_sphere" if color is None and pixels.border_color() is None else "constant"
+        kind = "inverted_sphere" if color is None and border_color(pixels) is None else "constant"
     if color is None and kind != "none":
-        color = tuple(pixels.border_median().tolist())
+        color = tuple(border_median(pixels).tolist())
     return SceneFacts(
         response=response,
         median_radiance=median,

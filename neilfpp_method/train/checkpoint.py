@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from neilfpp_method.data.images import replacing
+from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.errors import UserError
 
 __all__ = [

@@ -66,7 +66,7 @@ def test_a_command_line_that_makes_no_sense(tmp_path, monkeypatch, capfd, argume
         (["--device", "cuda:99"], ("no device 'cuda:99' here", "cpu")),
         (["--device", "abacus"], ("no device 'abacus' here", "cpu")),
         (["--device", "meta"], ("no device 'meta' here", "cpu")),
-        (["--test-every", "1"], ("all 6 views are held out",)),
+        (["--test-every", "1"], ("every 1-th view cannot be held out",)),
         (["--format", "tape"], ("unknown capture format 'tape'", "sfm_scene", "colmap")),
         (["--format", "colmap"], ("not a capture of the format colmap", "sparse/0")),
     ],

@@ -107,3 +107,15 @@ def test_bad_folders_are_named(tmp_path: Path, kind: str, complaint: str) -> Non
 def test_an_empty_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no images"):
         find_brackets(tmp_path)
+
+
+def test_the_response_of_camera_raw_cannot_be_srgb(tmp_path: Path) -> None:
+    brackets = {"a": {tmp_path / "a.dng": 0.1, tmp_path / "b.dng": 0.2}}
+    with pytest.raises(UserError, match=r"a\.dng: camera RAW is developed to linear radiance"):
+        merge_brackets(brackets, tmp_path / "images", tmp_path / "valid", "srgb")
+
+
+def test_camera_raw_and_other_images_are_not_merged_together(tmp_path: Path) -> None:
+    brackets = {"a": {tmp_path / "a.dng": 0.1, tmp_path / "b.jpg": 0.2}}
+    with pytest.raises(UserError, match=r"a\.dng is camera RAW, and other images of the folder are not"):
+        merge_brackets(brackets, tmp_path / "images", tmp_path / "valid")

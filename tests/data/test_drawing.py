@@ -26,9 +26,9 @@ def padded(bits: np.ndarray) -> np.ndarray:
 def test_the_kth_pixel_of_a_set_is_selected(count: int) -> None:
     bits = np.random.default_rng(count).integers(0, 16, count)
     bits[-1] = VALID | NEAR
-    for of, are in ((VALID, VALID), (VALID | NEAR, VALID | NEAR), (VALID | NEAR, VALID)):
-        chosen = PixelSet(padded(bits), of, are)
-        expected = np.flatnonzero((bits & of) == are)
+    for having, lacking in ((VALID, 0), (VALID | NEAR, 0), (VALID, NEAR)):
+        chosen = PixelSet(padded(bits), having, lacking)
+        expected = np.flatnonzero(((bits & having) == having) & ((bits & lacking) == 0))
         assert chosen.count == len(expected)
         assert np.array_equal(chosen.find(torch.arange(chosen.count)).numpy(), expected)
 

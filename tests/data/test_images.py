@@ -13,7 +13,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from neilfpp_method.data.images import image_header, read_image, replacing, write_exr, write_png
+from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.images import image_header, read_image, write_exr, write_png
 from neilfpp_method.errors import UserError
 
 HEIGHT, WIDTH = 5, 7
@@ -116,7 +117,9 @@ def test_the_exposure_of_a_radiance_file_is_divided_out(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"\n\n", b"\n" + b"# written by a tool\n" * 400 + factors, 1))
     assert np.allclose(read_image(path).pixels, before / 4 / [2.0, 1.0, 0.25])
     path.write_bytes(path.read_bytes().replace(b"=0.5", b"=0.0"))
-    with pytest.raises(UserError, match=r"a\.hdr: cannot be read \(an exposure or a color correction of 0\)"):
+    with pytest.raises(
+        UserError, match=r"a\.hdr: cannot be read \(an exposure or a colour correction of 0\)"
+    ):
         read_image(path)
 
 

@@ -41,8 +41,19 @@ def test_exposures_from_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["a.jpg 0", "a.jpg -1", "a.jpg nan", "a.jpg 1/0", "a.jpg", "a.jpg fast", "a.jpg 1e999"]
+    "text",
+    [
+        "a.jpg 0",
+        "a.jpg -1",
+        "a.jpg nan",
+        "a.jpg 1/0",
+        "a.jpg",
+        "a.jpg fast",
+        "a.jpg 1e999",
+        "a.jpg 1e-9999999999",
+    ],
 )
+@pytest.mark.timeout(20)
 def test_a_bad_list_of_exposures_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "exposures.txt").write_text(text)
     with pytest.raises(UserError, match=r"exposures\.txt"):

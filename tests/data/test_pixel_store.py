@@ -14,6 +14,7 @@ from neilfpp_method.data import pixel_store
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.drawing import near_object
 from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.pixel_encoding import HALF, MEDIAN_SAMPLES
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
@@ -82,6 +83,12 @@ def test_a_range_beyond_half_precision_is_kept_in_single(tmp_path: Path) -> None
     assert names == [view.name for view in capture.views], (
         "each view is reported once, though some were read twice"
     )
+
+
+def test_a_factor_that_single_precision_cannot_hold_is_refused() -> None:
+    dark = np.zeros((MEDIAN_SAMPLES, 1, 3), np.float32)
+    dark[0, 0, 1] = 1e-40  # not among the sampled values
+    assert HALF.encode(dark) is None
 
 
 def test_in_memory_and_in_a_folder_are_the_same(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy import stats
 
+from neilfpp_method.data.backdrop import border_color, border_colors, border_median
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.lens import Lens
@@ -199,7 +200,7 @@ def test_statistics_leave_invalid_pixels_out(tmp_path: Path) -> None:
         float((object_ @ torch.tensor([0.2126, 0.7152, 0.0722])).median())
     )
     assert pixels.radiance_quantile(1.0) == float(object_.max())
-    assert torch.equal(pixels.border_color(), torch.tensor([0.25, 0.25, 0.25]))
+    assert torch.equal(border_color(pixels), torch.tensor([0.25, 0.25, 0.25]))
 
 
 def test_a_capture_without_valid_pixels_is_refused(tmp_path: Path) -> None:
@@ -289,7 +290,7 @@ def test_radiance_quantile_counts_linear_values(tmp_path: Path) -> None:
 @pytest.mark.parametrize("hdr", [True, False])
 @pytest.mark.parametrize("background", [0.0, 0.5])
 def test_border_color_is_linear(tmp_path: Path, hdr: bool, background: float) -> None:
-    color = dataset(tmp_path, hdr=hdr, background=background).border_color()
+    color = border_color(dataset(tmp_path, hdr=hdr, background=background))
     assert np.allclose(color, background, atol=0.004)
 
 
@@ -300,25 +301,25 @@ def test_no_border_color_if_the_border_varies(tmp_path: Path) -> None:
         image = noise.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
         write_exr(root / "inputs" / "images" / f"{i:03d}.exr", {"RGB": image})
     capture = load_capture(root)
-    assert PixelDataset(capture, capture.views).border_color() is None
+    assert border_color(PixelDataset(capture, capture.views)) is None
 
 
 def test_no_border_color_under_a_sky(tmp_path: Path) -> None:
     """Most of the border is ground. The rest is sky, which cannot be a part of the scene."""
     capture = load_capture(make_sky_capture(tmp_path))
     pixels = PixelDataset(capture, capture.views)
-    border = pixels.border_colors()
+    border = border_colors(pixels)
     assert 0.5 < (border == GROUND).all(-1).mean() < 0.95
-    assert pixels.border_color() is None
-    assert np.allclose(pixels.border_median(), GROUND)
+    assert border_color(pixels) is None
+    assert np.allclose(border_median(pixels), GROUND)
 
 
 def test_a_table_that_extends_beyond_the_image_does_not_change_the_border_color() -> None:
     """The demo capture: a third of the border shows the table."""
     capture = load_capture(demo_scene())
     pixels = PixelDataset(capture, capture.train_views)
-    assert (pixels.border_colors() == 0).all(-1).mean() < 0.75
-    assert torch.equal(pixels.border_color(), torch.zeros(3))
+    assert (border_colors(pixels) == 0).all(-1).mean() < 0.75
+    assert torch.equal(border_color(pixels), torch.zeros(3))
 
 
 def test_loading_reports_each_view(tmp_path: Path) -> None:

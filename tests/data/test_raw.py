@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from fractions import Fraction
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,3 +120,17 @@ def test_without_rawpy_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
         UserError, match=r"a\.nef: camera RAW needs rawpy; pip install 'neilfpp-method\[raw\]'"
     ):
         develop(tmp_path / "a.nef")
+
+
+def test_an_image_of_another_size_than_its_sensor_is_named(tmp_path: Path, monkeypatch) -> None:
+    raw = SimpleNamespace(
+        raw_image_visible=np.zeros((4, 6)),
+        daylight_whitebalance=[1.0, 1.0, 1.0, 1.0],
+        postprocess=lambda **options: np.zeros((6, 4, 3), np.uint16),
+    )
+    library = ModuleType("rawpy")
+    library.imread = lambda path: nullcontext(raw)
+    library.ColorSpace, library.HighlightMode = SimpleNamespace(sRGB=1), SimpleNamespace(Clip=0)
+    monkeypatch.setitem(sys.modules, "rawpy", library)
+    with pytest.raises(UserError, match=r"a\.raf: 4×6 pixels from a sensor of 6×4"):
+        develop(tmp_path / "a.raf")

@@ -253,6 +253,27 @@ def test_a_capture_with_poses_keeps_them(tmp_path):
         assert (read_image(view.image).pixels == read_image(old.image).pixels).all()
 
 
+def test_a_test_view_that_auto_leaves_out_is_no_test_view_of_the_capture(tmp_path):
+    source = load_capture(make_capture(tmp_path / "sphere", masks=True))
+    black = source.test_views[0]
+    write_exr(black.image, {"RGB": np.zeros_like(read_image(black.image).pixels)})
+    assert prepare(tmp_path / "sphere", tmp_path / "out", "--auto") == 0
+    capture = load_capture(tmp_path / "out")
+    assert {view.name for view in capture.views} == {view.name for view in source.views} - {black.name}
+    assert capture.test == source.test - {black.name}
+
+
+def test_auto_says_if_it_leaves_out_no_view_because_too_few_would_remain(tmp_path, capsys):
+    source = load_capture(make_capture(tmp_path / "sphere", masks=True))
+    for view in source.views[1:5]:
+        write_exr(view.image, {"RGB": np.zeros_like(read_image(view.image).pixels)})
+    assert prepare(tmp_path / "sphere", tmp_path / "out", "--auto") == 0
+    assert len(load_capture(tmp_path / "out").views) == len(source.views)
+    assert (
+        "no view is left out: fewer than 3 would remain without 001, 002, 003, 004" in capsys.readouterr().out
+    )
+
+
 def test_a_colmap_project_keeps_its_poses_and_points(prepared, tmp_path):
     project = tmp_path / "project"
     shutil.copytree(prepared / "work" / "model" / "largest", project / "sparse" / "0")

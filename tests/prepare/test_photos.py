@@ -128,3 +128,11 @@ def test_exposures_are_used_if_all_are_known_and_pixels_are_linear(tmp_path):
     assert set(relative_exposures(survey(tmp_path, "srgb")).values()) == {1.0}
     jpeg(tmp_path / "d.jpg")
     assert set(relative_exposures(survey(tmp_path, "linear")).values()) == {1.0}
+
+
+def test_the_response_of_camera_raw_cannot_be_srgb(tmp_path):
+    for i in range(3):
+        (tmp_path / f"{i}.dng").write_bytes(b"")
+    assert survey(tmp_path, "auto").linear
+    with pytest.raises(UserError, match=r"0\.dng: camera RAW is developed to linear radiance"):
+        survey(tmp_path, "srgb")

@@ -1,6 +1,4 @@
-"""Rows of a tradeoff are runs: finished ones are kept, stopped ones continue, and budgets that are too small
-are left out.
-"""
+"""The runs of a tradeoff: finished ones are kept, stopped ones continue, too small budgets are left out."""
 
 from __future__ import annotations
 
@@ -13,8 +11,8 @@ from neilfpp_method.cli import main
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings import presets
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.tradeoff import rows
-from neilfpp_method.tradeoff.rows import TradeoffRequest, rows_of
+from neilfpp_method.tradeoff import planned_runs
+from neilfpp_method.tradeoff.planned_runs import TradeoffRequest, plan_runs
 from neilfpp_method.train.budget_record import read_budget
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config
@@ -37,7 +35,7 @@ def test_a_second_call_continues_and_repeats_nothing(tmp_path, words, clock, mon
     words += ["--budgets", "2m,1s,3m"]
     with monkeypatch.context() as patch:
         interrupt_at(patch, 12)
-        assert main(words) == 130  # in the row of 2m, as that of 1s is too small
+        assert main(words) == 130  # in the run of 2m, as that of 1s is too small
     assert "left out: a budget of 1s is too small" in capsys.readouterr().out
     assert read_budget(out / "2m-seed0").took is None
     # `neilfpp eval` has measured the stopped run.
@@ -61,14 +59,14 @@ def test_a_second_call_continues_and_repeats_nothing(tmp_path, words, clock, mon
 
 def test_a_run_that_cannot_be_measured_is_left_out(tmp_path, words, clock, monkeypatch, capsys):
     """A run without a surface fails in evaluation; the others still make a frontier."""
-    measure = rows.evaluate
+    measure = planned_runs.evaluate
 
     def fails_for_2m(run):
         if run.path.name == "2m-seed0":
             raise UserError("no surface within 3 scene units", "train for longer")
         return measure(run)
 
-    monkeypatch.setattr(rows, "evaluate", fails_for_2m)
+    monkeypatch.setattr(planned_runs, "evaluate", fails_for_2m)
     assert main([*words, "--budgets", "2m,3m"]) == 0
     assert "left out: no surface within 3 scene units" in capsys.readouterr().out
     points = json.loads((tmp_path / "out" / "tradeoff.json").read_text())["points"]
@@ -76,7 +74,7 @@ def test_a_run_that_cannot_be_measured_is_left_out(tmp_path, words, clock, monke
     assert "pbr_psnr" in points[0]["figures"]
 
 
-def test_a_row_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, clock, monkeypatch, capsys):
+def test_a_run_that_differs_in_any_setting_is_refused_by_name(tmp_path, words, clock, monkeypatch, capsys):
     assert main([*words, "--budgets", "2m"]) == 0
     run = tmp_path / "out" / "2m-seed0"
     assert main([*words, "--budgets", "2m"]) == 0
@@ -127,8 +125,8 @@ def test_bad_input_is_one_line(tmp_path, words, options, complaint, capsys):
 
 
 def test_seeds_start_at_that_of_the_settings(tmp_path):
-    found = rows_of(TradeoffRequest(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu"))
-    assert [row.name for row in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
-    assert [row.config.train.seed for row in found] == [3, 4, 3, 4]
+    found = plan_runs(TradeoffRequest(tmp_path, tmp_path, small_config(seed=3), [180.0, 60.0], 2, "cpu"))
+    assert [run.name for run in found] == ["1m-seed3", "1m-seed4", "3m-seed3", "3m-seed4"]
+    assert [run.config.train.seed for run in found] == [3, 4, 3, 4]
     with pytest.raises(UserError, match="contains a budget twice"):
-        rows_of(TradeoffRequest(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu"))
+        plan_runs(TradeoffRequest(tmp_path, tmp_path, small_config(), [60.0, 60.0], 1, "cpu"))

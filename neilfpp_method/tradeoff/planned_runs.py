@@ -29,7 +29,7 @@ from neilfpp_method.train.quality import read_checks
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
-__all__ = ["PlannedRun", "TradeoffRequest", "check_same", "measured", "rows_of", "run_row"]
+__all__ = ["PlannedRun", "TradeoffRequest", "check_same", "make_run", "measured", "plan_runs"]
 
 METRICS = "metrics.json"
 """File of a run with its metrics on test views."""
@@ -82,8 +82,8 @@ class PlannedRun:
         return self.out.name
 
 
-def rows_of(request: TradeoffRequest) -> list[PlannedRun]:
-    """A row for each budget and seed, in order of budget, with folders `OUT/10m-seed0` and so on.
+def plan_runs(request: TradeoffRequest) -> list[PlannedRun]:
+    """Plan a run for each budget and seed, by budget, with the folders `OUT/10m-seed0` and so on.
 
     Raises:
         UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
@@ -94,17 +94,17 @@ def rows_of(request: TradeoffRequest) -> list[PlannedRun]:
     if request.seeds < 1:
         raise UserError(f"--seeds is {request.seeds}", "set it to 1 or more")
     effects = "as-set" if config.preset.startswith("paper-") else "auto"
-    rows = []
+    runs = []
     for budget in sorted(budgets):
         for seed in range(config.train.seed, config.train.seed + request.seeds):
             out = request.out / f"{format_duration(budget)}-seed{seed}"
             seeded = replace(config, train=replace(config.train, seed=seed))
-            rows.append(PlannedRun(request.data, out, seeded, effects, budget, request.device))
-    return rows
+            runs.append(PlannedRun(request.data, out, seeded, effects, budget, request.device))
+    return runs
 
 
-def check_same(row: PlannedRun) -> None:
-    """Check that the folder of a row, if it contains a run, contains the run that the row describes.
+def check_same(run: PlannedRun) -> None:
+    """Check that the folder of a planned run, if it contains a run, contains that run.
 
     The numbers of steps and the settings that depend on the size of a step (`budget.sizes`) are compared with
     the plan of the run, because planning for a budget changes them.
@@ -112,20 +112,20 @@ def check_same(row: PlannedRun) -> None:
     Raises:
         UserError: if anything else differs; the message names the first difference.
     """
-    if not (row.out / "config.json").is_file():
+    if not (run.out / "config.json").is_file():
         return
-    described = read_description(row.out)
-    plan = read_budget(row.out)
-    planned = row.config if plan is None else planned_settings(plan, row.config)
-    effects = str(read_plan(row.out, described.config).request)
+    described = read_description(run.out)
+    plan = read_budget(run.out)
+    planned = run.config if plan is None else planned_settings(plan, run.config)
+    effects = str(read_plan(run.out, described.config).request)
     kept = described.source
-    source = CaptureSource(str(row.data.resolve()), scale=kept.scale, unit=kept.unit, center=kept.center)
-    wanted = _compared(planned, source, row.budget, str(parse_effects(row.effects)))
+    source = CaptureSource(str(run.data.resolve()), scale=kept.scale, unit=kept.unit, center=kept.center)
+    wanted = _compared(planned, source, run.budget, str(parse_effects(run.effects)))
     stored = _compared(described.config, described.source, plan and plan.budget, effects)
     for name in dict.fromkeys((*stored, *wanted)):
         if stored.get(name) != wanted.get(name):
             raise UserError(
-                f"{row.out}: a run of another capture or with other settings: {name} is {stored.get(name)}, "
+                f"{run.out}: a run of another capture or with other settings: {name} is {stored.get(name)}, "
                 f"not {wanted.get(name)}",
                 "choose another --out, or remove this folder",
             )
@@ -134,55 +134,55 @@ def check_same(row: PlannedRun) -> None:
 def _compared(
     config: NeilfConfig, source: CaptureSource, budget: float | None, effects: str
 ) -> dict[str, object]:
-    """The values, by name, that must agree for a run folder to belong to a row."""
+    """The values, by name, that must agree for a run folder to contain a planned run."""
     capture = {f"capture.{name}": value for name, value in asdict(source).items()}
     settings = flat_settings(to_dict(replace(config, train=with_steps(config.train, {}))))
     return {**capture, **settings, "--effects": effects, "the budget in seconds": budget}
 
 
-def run_row(row: PlannedRun, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
+def make_run(run: PlannedRun, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
     """Train and evaluate a run, or only the parts that are missing.
 
     Raises:
         UserError: for example if the budget is too small for this machine.
     """
-    exists = (row.out / "config.json").is_file()
-    plan = read_budget(row.out) if exists else None
+    exists = (run.out / "config.json").is_file()
+    plan = read_budget(run.out) if exists else None
     if plan is None or plan.took is None:
         request = TrainingRequest(
-            data=None if exists else row.data,
-            out=row.out,
-            config=None if exists else row.config,
+            data=None if exists else run.data,
+            out=run.out,
+            config=None if exists else run.config,
             resume=exists,
-            effects=None if exists else parse_effects(row.effects),
-            budget=row.budget,
-            device=row.device,
+            effects=None if exists else parse_effects(run.effects),
+            budget=run.budget,
+            device=run.device,
         )
         run_training(request, console, at_end)
-    if not _has_metrics(row.out):
-        run = at_size(load_run(row.out, pick_device(row.device)), None, None)
-        if run.capture.test_views:
-            write_metrics(row.out / METRICS, run, evaluate(run))
+    if not _has_metrics(run.out):
+        trained = at_size(load_run(run.out, pick_device(run.device)), None, None)
+        if trained.capture.test_views:
+            write_metrics(run.out / METRICS, trained, evaluate(trained))
 
 
-def measured(row: PlannedRun) -> RunResult | None:
+def measured(run: PlannedRun) -> RunResult | None:
     """The result of a run; None if it is not finished.
 
     Raises:
         UserError: if a file of the run is damaged.
     """
-    plan = read_budget(row.out)
+    plan = read_budget(run.out)
     if plan is None or plan.took is None:
         return None
-    known = read_json(row.out / METRICS) if _has_metrics(row.out) else {}
+    known = read_json(run.out / METRICS) if _has_metrics(run.out) else {}
     figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
-    checks = read_checks(row.out)
+    checks = read_checks(run.out)
     if checks:
         last = checks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
-    return RunResult(row.budget, row.config.train.seed, plan.took, figures)
+    return RunResult(run.budget, run.config.train.seed, plan.took, figures)
 
 
-def _has_metrics(run: Path) -> bool:
+def _has_metrics(folder: Path) -> bool:
     """Whether a run has metrics that are not older than its last checkpoint."""
-    return (run / METRICS).is_file() and not is_outdated(run / METRICS, run)
+    return (folder / METRICS).is_file() and not is_outdated(folder / METRICS, folder)
