@@ -31,7 +31,17 @@ from neilfpp_method.data.views import (
 )
 from neilfpp_method.errors import UserError
 
-__all__ = ["FOUND", "READERS", "Camera", "Capture", "Normalization", "Reader", "View", "load_capture"]
+__all__ = [
+    "FOUND",
+    "READERS",
+    "Camera",
+    "Capture",
+    "Normalization",
+    "Reader",
+    "View",
+    "load_capture",
+    "refuse_run",
+]
 
 TEST_EVERY = 8
 """Default split: every 8th view is a test view, as in mip-NeRF 360 and many papers after it."""
@@ -222,8 +232,7 @@ def _recognize(root: Path) -> str:
     for name, reader in READERS.items():
         if reader.recognize(root):
             return name
-    if (root / "config.json").is_file() and (root / "capture.json").is_file():
-        raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
+    refuse_run(root)
     _check_cameras(root)
     photographs = _photographs(root)
     if photographs:
@@ -231,6 +240,12 @@ def _recognize(root: Path) -> str:
         raise UserError(f"{root}: {photographs} photographs and no cameras", remedy)
     layouts = "; ".join(f"{name} ({reader.LAYOUT})" for name, reader in READERS.items())
     raise UserError(f"{root}: no capture in this folder", f"the formats are: {layouts}")
+
+
+def refuse_run(root: Path) -> None:
+    """Raise a `UserError` if the folder is that of a run, whose pictures are no photographs of a scene."""
+    if (root / "config.json").is_file() and (root / "capture.json").is_file():
+        raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
 
 
 def _check_cameras(root: Path) -> None:

@@ -151,6 +151,8 @@ def test_a_file_and_a_run_where_a_capture_is_wanted_and_the_reverse(tmp_path, ca
     for data, complaint in ((file, "a file, not a folder"), (trained, "a run folder, not a capture")):
         refused(capfd, ["train", "--data", data, "--out", tmp_path / "run"], data, complaint, leaves=tmp_path)
         refused(capfd, ["inspect", data], data, complaint, leaves=tmp_path)
+        command = ["prepare", data, "--out", tmp_path / "prepared"]
+        refused(capfd, command, data, complaint.split(",")[0], leaves=tmp_path)
     refused(capfd, ["train", "--data", capture, "--out", file], file, "is a file; name a", leaves=tmp_path)
     for name in ("eval", "render", "relight", "export", "report", "view"):
         refused(capfd, [name, file], file, "no run here (a file)", leaves=tmp_path)
