@@ -99,6 +99,9 @@ class AttachedNeilf(nn.Module):
         """Alias of `losses`: the wrappers of data-parallel training call `forward`."""
         return self.losses(batch, step, hits)
 
+    # The number of hits changes in every step, and some steps fit the light by an optimisation of their own.
+    # `torch.compile` would trace all of it again and again, for minutes and into many small graphs.
+    @torch.compiler.disable
     def losses(self, batch: PixelBatch, step: int | Stage | str, hits: Rendered | None = None) -> Total:
         """Compute the losses of a training step; add `.loss` to the loss of your loop.
 
@@ -157,6 +160,7 @@ class AttachedNeilf(nn.Module):
             self.watch.judge(measured, self.step_guard.skipped, self._steps)
         return self.watch.health
 
+    @torch.compiler.disable
     def maps(self, rays: RayBatch | Camera, hits: Rendered | None = None) -> Maps:
         """Render all maps of a view, one row per ray: material, shading, normal, depth (`structures.Maps`).
 
@@ -217,6 +221,7 @@ class AttachedNeilf(nn.Module):
         self._check_device_and_dtype("wi", wi)
         return self.model.incident_light(x, wi)
 
+    @torch.compiler.disable
     def shade(self, hits: SurfaceHits, wo: Float[Tensor, "N 3"]) -> Shading:
         """Outgoing radiance of hits towards wo by the rendering equation; 0 for rays without a hit."""
         settings = self.model.config.shading

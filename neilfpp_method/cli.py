@@ -39,6 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # Names and signs that the encoding of the output lacks are printed as "?".
             stream.reconfigure(errors="replace")
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:2], "--help"]
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
         return 0

@@ -16,6 +16,15 @@ TYRO_MISSING = "Missing from"
 """Beginning of tyro's message about options that are required; their names and descriptions follow."""
 NAME = re.compile("│     [^ ].*")
 """A line of that message with the name of an option; descriptions are indented further."""
+UNPARSED = re.compile(
+    r"Error parsing (?P<option>\S+): "
+    r"(?:no type matching (?P<wanted>.+) could be instantiated from \[(?P<list>.*)\]"
+    r"|invalid literal for int\(\) with base 10: (?P<whole>.*)"
+    r"|could not convert string to float: (?P<real>.*))"
+)
+"""Tyro's messages about values that are no numbers."""
+NUMBERS = {"INT": "a whole number", "FLOAT": "a number"}
+"""Tyro's names of the types of single numbers, and what they are called in messages."""
 TYRO_UNKNOWN = "Unrecognized options:"
 """Beginning of tyro's message about unknown options."""
 
@@ -55,6 +64,8 @@ def mistake(complaint: str, arguments: Sequence[str]) -> Mistake:
         else:
             paragraphs.append([])
     what = " ".join(paragraphs[0]).rstrip(".")
+    if unparsed := UNPARSED.fullmatch(what):
+        return Mistake(_unparsed(unparsed), None)
     if what.startswith(TYRO_MISSING):
         return Mistake(_missing(complaint) or what, None)
     return Mistake(what, _flag_with_a_value(what, arguments) or _suggested(what, paragraphs))
@@ -67,6 +78,20 @@ def _boxed(complaint: str) -> str:
     """
     body = complaint.splitlines()[2:]
     return "\n".join("│" + (line.replace("-", "─") if not line.strip("- ") else line)[1:] for line in body)
+
+
+def _unparsed(found: re.Match[str]) -> str:
+    """What was given, and what is wanted.
+
+    >>> _unparsed(UNPARSED.fullmatch("Error parsing --views: invalid literal for int() with base 10: 'all'"))
+    "--views: 'all' is not a whole number"
+    """
+    given = found["whole"] or found["real"]
+    if given:
+        return f"{found['option']}: {given} is not {NUMBERS['INT' if found['whole'] else 'FLOAT']}"
+    kinds = found["wanted"].removeprefix("{None}|").strip("{}").split()
+    wanted = NUMBERS.get(kinds[0], kinds[0]) if len(kinds) == 1 else f"{len(kinds)} numbers"
+    return f"{found['option']}: {found['list'].replace(',', '')} is not {wanted}"
 
 
 def _missing(complaint: str) -> str:

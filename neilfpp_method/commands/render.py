@@ -44,7 +44,7 @@ class Render:
 
 
 def run(options: Render) -> None:
-    from neilfpp_method.evaluate.render_views import render_run
+    from neilfpp_method.evaluate.render_views import finished_views, render_run
     from neilfpp_method.evaluate.sheet import write_light_picture
     from neilfpp_method.evaluate.size import at_size, describe_size
     from neilfpp_method.kernels.process import computing_fast
@@ -60,6 +60,13 @@ def run(options: Render) -> None:
     if size := describe_size(run):
         terminal().print(size, soft_wrap=True)
     if "maps" in options.what:
+        kept = [] if options.overwrite else finished_views(run, out, (options.views,), options.confidence)
+        if kept:
+            terminal().print(
+                f"{len(kept)} of the views exist already and are kept, whatever checkpoint and size they "
+                "have; --overwrite renders them again",
+                soft_wrap=True,
+            )
         with computing_fast(), progress_bar("rendering") as advance:
             render_run(run, out, (options.views,), options.overwrite, options.confidence, advance)
     if (

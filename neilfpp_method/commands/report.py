@@ -37,14 +37,14 @@ def run(options: Report) -> None:
     from neilfpp_method.kernels.process import computing_fast
     from neilfpp_method.report.write import REPORT, ReportOptions, write_report
     from neilfpp_method.train.device import pick_device
-    from neilfpp_method.train.output import check_writable
+    from neilfpp_method.train.output import check_page
     from neilfpp_method.train.run import read_description
 
     read_description(options.run)
     contents = ReportOptions(options.views, options.size, options.confidence)
     contents.check()
     out = options.out or options.run / REPORT
-    check_writable(out)
+    check_page(out)
     messages: list[str] = []
     with computing_fast(), progress_bar("report") as advance:
         write_report(

@@ -31,7 +31,17 @@ from neilfpp_method.data.views import (
 )
 from neilfpp_method.errors import UserError
 
-__all__ = ["BOX_SOURCES", "READERS", "Camera", "Capture", "Normalization", "Reader", "View", "load_capture"]
+__all__ = [
+    "BOX_SOURCES",
+    "READERS",
+    "Camera",
+    "Capture",
+    "Normalization",
+    "Reader",
+    "View",
+    "load_capture",
+    "refuse_run",
+]
 
 
 @dataclass(frozen=True)
@@ -228,8 +238,7 @@ def _recognize(root: Path) -> str:
     for name, reader in READERS.items():
         if reader.recognize(root):
             return name
-    if (root / "config.json").is_file() and (root / "capture.json").is_file():
-        raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
+    refuse_run(root)
     _check_cameras(root)
     photographs = _photographs(root)
     if photographs:
@@ -237,6 +246,12 @@ def _recognize(root: Path) -> str:
         raise UserError(f"{root}: {photographs} photographs and no cameras", remedy)
     layouts = "; ".join(f"{name} ({reader.LAYOUT})" for name, reader in READERS.items())
     raise UserError(f"{root}: no capture in this folder", f"the formats are: {layouts}")
+
+
+def refuse_run(root: Path) -> None:
+    """Raise a `UserError` if the folder is that of a run, whose pictures are no photographs of a scene."""
+    if (root / "config.json").is_file() and (root / "capture.json").is_file():
+        raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
 
 
 def _check_cameras(root: Path) -> None:

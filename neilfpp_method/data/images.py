@@ -197,6 +197,8 @@ def _decoders_silent() -> Iterator[None]:
 
 def _format(path: Path) -> Format:
     suffix = path.suffix.lower()
+    if path.is_dir():
+        raise UserError(f"{path}: a folder where an image is wanted", "name a file in it")
     if suffix not in FORMATS:
         raise UserError(f"{path}: not an image format that is read", f"use one of {', '.join(FORMATS)}")
     if not path.is_file():

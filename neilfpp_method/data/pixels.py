@@ -210,7 +210,8 @@ class PixelDataset:
         positive = self._positive_luminance()
         if not len(positive):
             raise UserError(
-                f"{self.capture.root}: all pixels of the object are black", "check images and masks"
+                f"{self.capture.root}: all pixels of the object are black",
+                "check images and masks: white is the object",
             )
         return float(positive.median())
 

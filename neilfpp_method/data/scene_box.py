@@ -67,7 +67,8 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
     """
     for view in views:
         check_camera(view.camera, str(view.image))
-    outlines = read_outlines(views)
+    # A mask of nothing, which a training refuses and `neilfpp inspect` names, says nothing about the box.
+    outlines = [outline for outline in read_outlines(views) if outline.inside.any()]
     if points is not None and outlines:
         points = points[agreement(outlines, points) >= AGREEMENT]
     if points is not None and len(points) >= MIN_POINTS:

@@ -13,7 +13,16 @@ from jaxtyping import Bool, Float64, Int64
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.views import View, pixel_index, project, scaled_camera
 
-__all__ = ["AGREEMENT", "MAX_VIEWS", "Outline", "SilhouetteCounts", "agreement", "read_outlines", "sightings"]
+__all__ = [
+    "AGREEMENT",
+    "MAX_VIEWS",
+    "Outline",
+    "SilhouetteCounts",
+    "agreement",
+    "outline_of",
+    "read_outlines",
+    "sightings",
+]
 
 AGREEMENT = 0.9
 """Smallest share of the views that see a point whose silhouettes must contain it."""
@@ -56,11 +65,12 @@ def read_outlines(
         image = read_image(view.mask or view.image)
         values = image.alpha if view.mask is None else image.mask
         if values is not None:
-            outlines.append(_outline(view, values > 0.5, max_side))
+            outlines.append(outline_of(view, values > 0.5, max_side))
     return outlines if len(outlines) >= len(chosen) / 2 else []
 
 
-def _outline(view: View, mask: Bool[np.ndarray, "H W"], max_side: int) -> Outline:
+def outline_of(view: View, mask: Bool[np.ndarray, "H W"], max_side: int = MAX_SIDE) -> Outline:
+    """Return the silhouette of a mask, reduced to at most `max_side` pixels a side."""
     factor = max_side / max(mask.shape)
     if factor < 1:
         height, width = (max(1, round(factor * side)) for side in mask.shape)

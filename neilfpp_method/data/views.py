@@ -7,6 +7,7 @@ Cameras have OpenCV axes (x right, y down, z forward). The centre of pixel (colu
 from __future__ import annotations
 
 import itertools
+import os
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -230,6 +231,10 @@ def inside(root: Path, path: Path) -> Path:
         path.exists()
         if path.resolve().is_relative_to(root.resolve()):
             return path
+        if path.exists() and Path(os.path.abspath(path)).is_relative_to(os.path.abspath(root)):
+            link = next(p for p in (path, *path.parents) if p.is_symlink())
+            problem = f"{path}: not a path within the capture folder {root}, because {link.name} is a link"
+            raise UserError(problem, "replace the link by a copy of its files, as cp -rL makes it")
     except (OSError, RuntimeError, ValueError):
         # The name is too long, links form a loop, or the name contains a null byte.
         pass

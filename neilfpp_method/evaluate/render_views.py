@@ -14,7 +14,7 @@ from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.views import RenderedView, render_view
 from neilfpp_method.train.run import Run, check_material
 
-__all__ = ["render_run"]
+__all__ = ["finished_views", "render_run"]
 
 LAYERS = {"normal": "XYZ"}
 """Channel names of EXR layers that are not RGB."""
@@ -52,6 +52,7 @@ def render_run(
         UserError: the capture has no such view, or `confidence` is set and the run has no material yet.
     """
     names = {view.name for view in run.capture.chosen_views(views)}
+    kept = set() if overwrite else set(finished_views(run, out, views, confidence))
     if confidence:
         check_material(run)
     residuals = measure_residuals(run) if confidence else None
@@ -60,10 +61,7 @@ def render_run(
         if view.name not in names:
             continue
         written.append(out / f"{view.name}.exr")
-        complete = written[-1].exists() and (
-            not confidence or _picture(out, "base_color_std", view.name).exists()
-        )
-        if overwrite or not complete:
+        if view.name not in kept:
             done = len(written) - 1
             rendered = render_view(
                 run, i, lambda share, done=done: on_progress((done + RENDERING * share) / len(names))
@@ -71,6 +69,20 @@ def render_run(
             _write(rendered if residuals is None else with_deviation(run, residuals, rendered), out)
         on_progress(len(written) / len(names))
     return written
+
+
+def finished_views(run: Run, out: Path, views: Sequence[str], confidence: bool = False) -> list[str]:
+    """Return the names of the views that `render_run` does not render again, because their files exist.
+
+    Raises:
+        UserError: the capture has no such view.
+    """
+    return [
+        view.name
+        for view in run.capture.chosen_views(views)
+        if (out / f"{view.name}.exr").exists()
+        and (not confidence or _picture(out, "base_color_std", view.name).exists())
+    ]
 
 
 def _write(view: RenderedView, out: Path) -> None:

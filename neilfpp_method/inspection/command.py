@@ -13,9 +13,9 @@ from rich.text import Text
 from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import write_png
+from neilfpp_method.data.object_source import object_line
 from neilfpp_method.errors import EarlyEnd
 from neilfpp_method.inspection.defects import Inspection, inspect_capture
-from neilfpp_method.inspection.measure import ObjectSource
 from neilfpp_method.inspection.picture import draw
 
 __all__ = ["run_inspection", "to_json"]
@@ -128,25 +128,13 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
     }
 
 
-def _object_line(sources: list[ObjectSource]) -> str:
-    """What shows the object in the views, in one line: mask files are not the only possibility."""
-    counts = {source: sources.count(source) for source in dict.fromkeys(sources) if source != "nothing"}
-    known = [
-        f"the {source}" + (f" in {count} of {len(sources)} views" if count < len(sources) else "")
-        for source, count in counts.items()
-    ]
-    if not known:
-        return "object: no mask, alpha channel or background of one colour shows it; all pixels count"
-    return f"object: shown by {' and '.join(known)}"
-
-
 def _print(inspection: Inspection, console: Console) -> None:
     def say(*parts: str | tuple[str, str]) -> None:
         console.print(Text.assemble(*parts), soft_wrap=True)
 
     placement, radiance = inspection.placement, inspection.radiance
     say(inspection.capture.summary)
-    say(_object_line([view.object_from for view in inspection.views if not view.unreadable]))
+    say(object_line([view.object_from for view in inspection.views if not view.unreadable]))
     say(
         f"cameras: a median angle of {placement.gap:.0f}° to the nearest camera; they cover "
         f"{100 * placement.coverage:.0f} % of all directions"

@@ -9,7 +9,9 @@ from typing import Literal
 import numpy as np
 
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.inverted_masks import look_inverted
 from neilfpp_method.data.point_cloud import load_point_cloud
+from neilfpp_method.data.silhouettes import Outline
 from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.measure import ViewFigures, measure
 from neilfpp_method.inspection.radiance import RadianceQuality, radiance_quality
@@ -26,6 +28,7 @@ __all__ = [
     "Inspection",
     "inspect_capture",
     "problems",
+    "problems_of_masks",
     "problems_of_poses",
     "views_to_leave_out",
 ]
@@ -124,7 +127,13 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
         on_view(view.name)
     placement = camera_placement(capture)
     factors = tuple(exposure_factors([view.luminance for view in views], placement).tolist())
-    defects = (*_of_views(views, factors, capture), *_of_cameras(capture, placement), *_of_scene(capture))
+    outlines = [view.outline for view in views if view.outline is not None]
+    defects = (
+        *_of_masks(outlines),
+        *_of_views(views, factors, capture),
+        *_of_cameras(capture, placement),
+        *_of_scene(capture),
+    )
     radiance = radiance_quality(views, capture.hdr, {defect.kind for defect in defects})
     order = {"problem": 0, "warning": 1}
     ranked = tuple(sorted(defects, key=lambda defect: order[defect.severity]))
@@ -140,6 +149,11 @@ def problems_of_poses(capture: Capture) -> tuple[str, ...]:
     """The same as `problems`, for cameras and point cloud only; fast, because no image is read."""
     found = (*_of_cameras(capture, camera_placement(capture)), *_of_scene(capture))
     return _lines_of_problems(found)
+
+
+def problems_of_masks(outlines: Sequence[Outline]) -> tuple[str, ...]:
+    """The same as `problems`, for masks that have been read already."""
+    return _lines_of_problems(tuple(_of_masks(outlines)))
 
 
 def _lines_of_problems(defects: Sequence[Defect]) -> tuple[str, ...]:
@@ -170,6 +184,14 @@ def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: C
     readable = [view for view in views if not view.unreadable]
     yield from _of_pictures(readable)
     yield from _of_values(readable, capture)
+
+
+def _of_masks(outlines: Sequence[Outline]) -> Iterator[Defect]:
+    """Masks of the surroundings instead of the object."""
+    if outlines and look_inverted(outlines):
+        text = "the masks look inverted: they are black on the object and white around it"
+        remedy = "invert the masks, or the alpha channel: the object is white"
+        yield Defect("inverted_masks", "problem", text, remedy)
 
 
 def _of_files(views: Sequence[ViewFigures]) -> Iterator[Defect]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -12,13 +11,15 @@ import torch
 from jaxtyping import Bool, Float32
 
 from neilfpp_method.data.images import ImageFile, read_image
+from neilfpp_method.data.object_source import ObjectSource
 from neilfpp_method.data.pixel_store import BORDER_SHARE
+from neilfpp_method.data.silhouettes import Outline, outline_of
 from neilfpp_method.data.view_pixels import pixel_colors
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_linear
 
-__all__ = ["ObjectSource", "ViewFigures", "measure"]
+__all__ = ["ViewFigures", "measure"]
 
 THUMBNAIL_SIDE = 160
 """Longest side of the thumbnail of a view, in pixels."""
@@ -36,10 +37,6 @@ MIN_CLIPPED = 16
 """Smallest number of pixels at the maximum of a linear image that counts as clipping."""
 LEVEL_SAMPLES = 200_000
 """Number of pixels, up to a factor of two, from which the distinct levels are counted."""
-
-
-ObjectSource = Literal["mask file", "alpha channel", "background of one colour", "nothing"]
-"""What shows which pixels of a view are on the object."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +64,7 @@ class ViewFigures:
         levels: number of distinct values among up to 400,000 pixels of the object, in the channel with the
             most.
         object_from: what shows which pixels are the object; "nothing": all pixels count as the object.
+        outline: the mask file or the alpha channel, at most 160 pixels a side; None if there is neither.
         small: thumbnail in linear radiance, at most 160 pixels a side.
     """
 
@@ -81,6 +79,7 @@ class ViewFigures:
     pixels: int = 0
     levels: int = 0
     object_from: ObjectSource = "nothing"
+    outline: Outline | None = field(default=None, repr=False)
     small: Float32[np.ndarray, "h w 3"] = field(
         default_factory=lambda: np.zeros((1, 1, 3), np.float32), repr=False
     )
@@ -100,7 +99,8 @@ def measure(view: View, hdr: bool) -> ViewFigures:
     source: ObjectSource = "mask file"
     if mask is None and image.alpha is not None:
         mask, source = image.alpha > 0.5, "alpha channel"
-    elif mask is None:
+    outline = None if mask is None else outline_of(view, mask, THUMBNAIL_SIDE)
+    if mask is None:
         mask = _off_the_background(color, usable)
         source = "nothing" if mask is None else "background of one colour"
     chosen = usable if mask is None else usable & mask
@@ -121,6 +121,7 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         pixels=int(chosen.sum()),
         levels=_levels(color[chosen]),
         object_from=source,
+        outline=outline,
         small=_fitted(linear, THUMBNAIL_SIDE),
     )
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from rich.console import Console
 
 from neilfpp_method.data.bracket_folder import Brackets
-from neilfpp_method.data.capture import READERS, Capture, load_capture
+from neilfpp_method.data.capture import READERS, Capture, load_capture, refuse_run
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing
 from neilfpp_method.data.split import check_test_every
@@ -65,6 +65,8 @@ def run_prepare(options: Prepare, console: Console) -> Path:
 def _prepare(options: Prepare, console: Console) -> Path:
     posed = any(reader.recognize(options.images) for reader in READERS.values())
     capture = load_capture(options.images, response=options.response) if posed else None
+    if not posed:
+        refuse_run(options.images)
     photos = None if posed else survey(options.images, options.response)
     _check_readable(tuple(photos.unreadable.values()) if photos else (), options)
     brackets = photos and brackets_among(photos, options.brackets)

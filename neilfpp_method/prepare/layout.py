@@ -152,7 +152,7 @@ def _cloud(source: PoseSource, prepared: Capture, options: Prepare, after: Step,
     if source.points is not None:
         return _Cloud(oriented(source.points), f"sparse: structure from motion{no_dense}")
     nothing = WorldPoints(np.empty((0, 3)), np.empty((0, 3)))
-    return _Cloud(nothing, f"none: the poses came without points{no_dense}")
+    return _Cloud(nothing, f"none: the poses came without points that have normals{no_dense}")
 
 
 def _dense(prepared: Capture, options: Prepare, after: Step, open_bar: Bars) -> WorldPoints:

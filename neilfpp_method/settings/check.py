@@ -18,6 +18,8 @@ COUNTS = {
 """Settings that are at least 1, by group."""
 SHARES = {"shading": ("hit_share",), "brdf": ("initial_base_color", "initial_metallic")}
 """Settings between 0 and 1, by group."""
+MAX_SEED = 2**32 - 1
+"""Largest seed. The seed of a step is a multiple of it (`seed_step`) that must fit into 64 bits."""
 
 
 def check_config(config: NeilfConfig) -> None:
@@ -46,6 +48,7 @@ def _check_ranges(config: NeilfConfig) -> None:
     for group, names in COUNTS.items():
         for name in names:
             _require(getattr(getattr(config, group), name) >= 1, config, group, name, "1 or more")
+    _require(0 <= config.train.seed <= MAX_SEED, config, "train", "seed", f"0 to {MAX_SEED}")
     for group, names in SHARES.items():
         for name in names:
             _require(0 <= getattr(getattr(config, group), name) <= 1, config, group, name, "0 to 1")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.held_back import PATCHES, hold_back
+from neilfpp_method.data.object_source import object_line, object_sources, stored_masks
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import record_exposures, record_facts
@@ -22,7 +23,7 @@ from neilfpp_method.effects.table import effects_table
 from neilfpp_method.errors import Unsound
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.mesh import MeshHost
-from neilfpp_method.inspection.defects import problems_of_poses
+from neilfpp_method.inspection.defects import problems_of_masks, problems_of_poses
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.facts import SceneFacts
@@ -186,8 +187,11 @@ def _create(run: OpenRun, facts: SceneFacts) -> None:
 def _describe_new(
     run: OpenRun, model: NeilfModel, pixels: PixelDataset, processes: int, console: Console
 ) -> None:
-    """Print problems of the poses and of a given mesh, and how images, point cloud and exposures are used."""
-    for line in problems_of_poses(run.capture):
+    """Print what shows the object, problems of masks, poses and a given mesh, and how images, point cloud and
+    exposures are used.
+    """
+    console.print(object_line(object_sources(pixels.store)), soft_wrap=True)
+    for line in (*problems_of_masks(stored_masks(pixels.store)), *problems_of_poses(run.capture)):
         console.print(line, style="yellow", soft_wrap=True, markup=False)
     if isinstance(model.host, MeshHost) and (warning := measure_mesh_fit(model.host, pixels).warning):
         console.print(warning, style="yellow", soft_wrap=True)

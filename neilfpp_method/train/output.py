@@ -8,7 +8,11 @@ from pathlib import Path
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 
-__all__ = ["check_folder", "check_writable", "default_folder"]
+__all__ = ["check_folder", "check_page", "check_writable", "default_folder"]
+
+PAGE = (".html", ".htm")
+RECORDS = ("capture.json", "config.json", "effects.json", "environment.json", "scene.json", "split.json")
+"""Names of files that describe a run or a capture, which a result must not replace."""
 
 
 def default_folder(data: Path, config: NeilfConfig) -> Path:
@@ -20,11 +24,27 @@ def check_writable(path: Path) -> None:
     """Check that a file can be written. Its folder need not exist.
 
     Raises:
-        UserError: the path is a folder, or a folder above it cannot be written to.
+        UserError: the path is a folder or a file that describes a run, or a folder above it cannot be written
+            to.
     """
     if path.is_dir():
         raise UserError(f"{path}: is a folder", "name a file with --out")
+    if path.name in RECORDS and path.exists():
+        raise UserError(
+            f"{path}: describes a run or a capture, and would be replaced", "choose another --out"
+        )
     _check_above(path, path)
+
+
+def check_page(path: Path) -> None:
+    """The same as `check_writable` for a page, whose name must say that it is one.
+
+    Raises:
+        UserError: as `check_writable`, or the name has another suffix.
+    """
+    check_writable(path)
+    if path.suffix.lower() not in PAGE:
+        raise UserError(f"{path}: a report is an HTML page", "give --out a name that ends in .html")
 
 
 def check_folder(path: Path) -> None:

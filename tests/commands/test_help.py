@@ -22,7 +22,7 @@ def completion() -> str:
     return printed.getvalue()
 
 
-@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"]])
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
 def test_help_names_the_commands(arguments, capsys):
     assert main(arguments) == 0
     said = capsys.readouterr().out
@@ -30,6 +30,11 @@ def test_help_names_the_commands(arguments, capsys):
         assert f"  {name} " in said
         assert command.summary in said
     assert "examples:" in said
+
+
+def test_help_may_come_first(capsys):
+    assert main(["help", "render"]) == 0
+    assert "neilfpp render runs/teapot --views all" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", COMMANDS)

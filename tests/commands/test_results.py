@@ -100,6 +100,14 @@ def test_render_writes_every_map(trained, tmp_path, capfd):
         == 0
     )
     assert len(list((tmp_path / "all").glob("*.exr"))) == 6
+    capfd.readouterr()
+    (tmp_path / "all" / "000.exr").unlink()
+    again = ["render", str(trained), "--device", "cpu", "--out", str(tmp_path / "all"), "--width", "12"]
+    assert main([*again, "--views", "all"]) == 0
+    kept = "5 of the views exist already and are kept, whatever checkpoint and size they have; --overwrite"
+    assert kept in capfd.readouterr().out
+    assert main([*again, "--overwrite"]) == 0
+    assert "are kept" not in capfd.readouterr().out
 
 
 def test_export_writes_the_surface_where_it_was_captured(trained, tmp_path, capfd):

@@ -127,12 +127,32 @@ def test_a_file_where_a_folder_is_wanted_and_the_reverse(tmp_path, capfd, traine
     refused(capfd, [name, trained, "--out", out, "--device", "cpu", *rest], out, complaint, leaves=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("command", "name", "complaint"),
+    [
+        (
+            "report",
+            "config.json",
+            "describes a run or a capture, and would be replaced; choose another --out",
+        ),
+        ("eval", "config.json", "describes a run or a capture, and would be replaced; choose another --out"),
+        ("report", "report.pdf", "a report is an HTML page; give --out a name that ends in .html"),
+    ],
+)
+def test_a_result_replaces_no_file_of_another_kind(tmp_path, capfd, trained, command, name, complaint):
+    out = tmp_path / name
+    out.write_text("{}")
+    refused(capfd, [command, trained, "--out", out, "--device", "cpu"], out, complaint, leaves=tmp_path)
+
+
 def test_a_file_and_a_run_where_a_capture_is_wanted_and_the_reverse(tmp_path, capfd, capture, trained):
     file = tmp_path / "file"
     file.write_text("")
     for data, complaint in ((file, "a file, not a folder"), (trained, "a run folder, not a capture")):
         refused(capfd, ["train", "--data", data, "--out", tmp_path / "run"], data, complaint, leaves=tmp_path)
         refused(capfd, ["inspect", data], data, complaint, leaves=tmp_path)
+        command = ["prepare", data, "--out", tmp_path / "prepared"]
+        refused(capfd, command, data, complaint.split(",")[0], leaves=tmp_path)
     refused(capfd, ["train", "--data", capture, "--out", file], file, "is a file; name a", leaves=tmp_path)
     for name in ("eval", "render", "relight", "export", "report", "view"):
         refused(capfd, [name, file], file, "no run here (a file)", leaves=tmp_path)

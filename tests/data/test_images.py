@@ -367,5 +367,7 @@ def test_a_header_of_100_000_columns_costs_no_memory(tmp_path: Path) -> None:
 
 def test_unknown_formats_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.webp").write_bytes(b"RIFF")
+    with pytest.raises(UserError, match="a folder where an image is wanted; name a file in it"):
+        read_image(tmp_path)
     with pytest.raises(UserError, match=r"a\.webp: not an image format that is read; use one of \.exr"):
         image_header(tmp_path / "a.webp")

@@ -87,6 +87,17 @@ def test_opaque_images_have_no_silhouettes(tmp_path: Path) -> None:
     assert find_box([*map(opaque, masked[:9]), *masked[9:]]).source == "cameras"
 
 
+def test_a_mask_of_nothing_has_no_influence(tmp_path: Path) -> None:
+    """`neilfpp inspect` has to load the capture, or else it could not name the view."""
+    masked = views(tmp_path, masks=True)
+    expected = find_box([*masked[:3], *masked[4:]])
+    write_png(masked[3].mask, np.zeros((48, 64), np.uint8))
+    assert find_box(masked).normalization.scale == pytest.approx(expected.normalization.scale, rel=1e-6)
+    for view in masked:
+        write_png(view.mask, np.zeros((48, 64), np.uint8))
+    assert find_box(masked).source == "cameras"
+
+
 def test_cameras_that_look_in_one_direction_or_apart_are_refused(tmp_path: Path) -> None:
     first, second, *_ = views(tmp_path)
     with pytest.raises(UserError, match="look in one direction"):

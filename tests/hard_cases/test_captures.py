@@ -148,7 +148,14 @@ def test_links_do_not_lead_out_of_the_capture(tmp_path: Path, what: str) -> None
     inside, outside = root / "inputs" / what, tmp_path / "outside"
     os.rename(inside, outside)
     inside.symlink_to(outside)
-    refused(root, Path(what).name, "not a path within the capture folder")
+    refused(root, Path(what).name, "not a path within the capture folder", f"{inside.name} is a link")
+
+
+def test_a_linked_folder_of_images_is_named(tmp_path: Path) -> None:
+    root = make_capture(tmp_path / "capture")
+    (root / "inputs" / "images").rename(tmp_path / "elsewhere")
+    (root / "inputs" / "images").symlink_to(tmp_path / "elsewhere")
+    refused(root, "because images is a link; replace the link by a copy of its files")
 
 
 def test_ambiguous_file_names(tmp_path: Path) -> None:

@@ -251,3 +251,16 @@ def test_with_strict_a_problem_gives_status_1(capture: Capture, tmp_path: Path, 
     assert main(["inspect", str(capture.root), "--strict"]) == 1
     assert capfd.readouterr().err.count("\n") == 1
     assert main(["inspect", str(tmp_path / "nowhere")]) == 2
+
+
+def test_inverted_masks_are_a_problem(tmp_path: Path, capfd) -> None:
+    """The background is not black, so that the pixels under the inverted masks look plausible."""
+    root = make_capture(tmp_path, views=6, hdr=False, masks=True, background=0.2)
+    assert main(["inspect", str(root)]) == 0
+    assert "look inverted" not in capfd.readouterr().out
+    for path in (root / "inputs" / "masks").iterdir():
+        write_png(path, 255 - np.asarray(Image.open(path)))
+    assert main(["inspect", str(root)]) == 0
+    said = capfd.readouterr().out
+    assert "problem: the masks look inverted: they are black on the object" in said
+    assert "invert the masks, or the alpha channel: the object is white" in said

@@ -29,6 +29,8 @@ WRONG = {
         "train-samples is 0; set it to 1",
     ),
     "no rays": (preset("fast"), "train", {"rays": 0}, "--config.train.rays is 0; set it to 1 or more"),
+    "a negative seed": (preset("fast"), "train", {"seed": -1}, "train.seed is -1; set it to 0 to 4294967295"),
+    "a seed beyond 32 bits": (preset("fast"), "train", {"seed": 2**32}, "train.seed is 4294967296"),
     "more than the whole weight": (preset("fast"), "shading", {"hit_share": 1.5}, "hit-share is 1.5"),
     "a rate that climbs": (
         preset("fast"),

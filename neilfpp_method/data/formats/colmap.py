@@ -68,6 +68,7 @@ def read(root: Path) -> CaptureFiles:
     inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
     if inputs is None:
         _check_spaces(root, folder, first)
+        _check_reduced(root, first)
         raise UserError(
             f"{root}: there is no images/{first}", "put the images of the model into the folder images"
         )
@@ -152,6 +153,17 @@ def _check_spaces(root: Path, model: Path, first: str) -> None:
             f"{model}: names of images end at their first space in a text model, as {first!r}",
             "export the model as binary, or rename the images and reconstruct again",
         )
+
+
+def _check_reduced(root: Path, first: str) -> None:
+    """Raise a `UserError` if there are only reduced copies of the images, as of mip-NeRF 360."""
+    for folder in sorted(root.glob("images_[1-9]")):
+        if stored(root, folder / first):
+            raise UserError(
+                f"{root}: there is no images/{first}, only {folder.name}, which the cameras do not fit",
+                "put the full images into the folder images, and train on reduced ones with "
+                f"--scale {1 / int(folder.name[-1]):.3g}",
+            )
 
 
 def _model_files(folder: Path) -> list[Path]:

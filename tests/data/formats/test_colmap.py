@@ -221,6 +221,12 @@ def test_images_that_are_missing_or_outside(tmp_path: Path) -> None:
     refused(tmp_path, "no images/000.png", "folder images")
 
 
+def test_reduced_images_only(tmp_path: Path) -> None:
+    """As of mip-NeRF 360, whose cameras are those of the full images."""
+    root = write(material(tmp_path, "images_4", masks=None), reconstruction(colmap_camera("PINHOLE")))
+    refused(root, "there is no images/000.png, only images_4, which the cameras do not fit", "--scale 0.25")
+
+
 def test_a_path_that_leaves_the_capture(tmp_path: Path) -> None:
     names = [f"{i:03d}.png" for i in range(5)] + ["../../secret.png"]
     root = tmp_path / "capture"
