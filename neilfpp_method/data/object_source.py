@@ -25,7 +25,7 @@ def stored_masks(store: PixelStore) -> list[Outline]:
     for i, source in enumerate(object_sources(store)):
         if source in ("mask file", "alpha channel"):
             camera = store.views[i].camera
-            mask = (store.bits[store.rows(i)] & MASK).astype(bool).reshape(camera.height, camera.width)
+            mask = (store.bits[store.indices(i)] & MASK).astype(bool).reshape(camera.height, camera.width)
             outlines.append(outline_of(store.views[i], mask))
             store.release()
     return outlines
@@ -50,9 +50,9 @@ def object_line(sources: Sequence[ObjectSource]) -> str:
 def _source(store: PixelStore, i: int) -> ObjectSource:
     if store.views[i].mask is not None:
         return "mask file"
-    known = (store.bits[store.rows(i)] & KNOWN) > 0
+    known = (store.bits[store.indices(i)] & KNOWN) > 0
     if not known.any():
         return "nothing"
     # An alpha channel decides on all pixels, a background of one colour only on the pixels that have it.
-    decided = known.all() and (store.bits[store.rows(i)] & MASK).any()
+    decided = known.all() and (store.bits[store.indices(i)] & MASK).any()
     return "alpha channel" if decided else "background of one colour"

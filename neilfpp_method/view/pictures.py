@@ -12,15 +12,14 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from neilfpp_method.data.views import Camera
-from neilfpp_method.evaluate.pictures import display, display_color
-from neilfpp_method.model import NeilfModel
+from neilfpp_method.evaluate.pictures import display, display_color, display_error
 from neilfpp_method.relight.cameras import pixel_rays, resized
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths
 from neilfpp_method.relight.sequence import SobolSequence
 from neilfpp_method.relight.surface import Intersections
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.view.speed import RenderSpeed, sizes
-from neilfpp_method.view.subject import Lighting, Subject, scene_of
+from neilfpp_method.view.subject import ERROR_LAYERS, Lighting, Subject, scene_of
 
 __all__ = ["PictureRequest", "ViewerFrame", "frames"]
 
@@ -32,6 +31,8 @@ SEED = 0
 """Seed of the first sample."""
 PAPER = 0.93
 """Grey of the background, as a display value in [0, 1]."""
+LARGEST_ERROR = 0.5
+"""Expected error from which a pixel has the brightest colour."""
 FAR = 100.0
 """Depth of pixels without a surface, scene units; the browser's own objects appear in front of it."""
 
@@ -144,27 +145,30 @@ def _path_shader(request: PictureRequest, camera: Camera, sample: int) -> Shader
 def _layer_shader(request: PictureRequest) -> Shader:
     """A deterministic shader of a layer."""
     subject, layer = request.subject, request.layer
-    model = subject.run.model
     if layer == "radiance":
-        return lambda rays, rows: _opaque(model.host.render(rays).color)
+        return lambda rays, rows: _opaque(subject.run.model.host.render(rays).color)
 
     def shade(rays: RayBatch, rows: Tensor) -> Tensor:
         hits = subject.surface.intersect(rays.origins, rays.directions)
         hits = hits[torch.nonzero(hits.outside)[:, 0]]
         result = rays.origins.new_zeros(len(rays), 4)
         if len(hits.rows):
-            result[hits.rows] = _opaque(_layer_at(model, layer, hits, -rays.directions[hits.rows]))
+            result[hits.rows] = _opaque(_layer_at(subject, layer, hits, -rays.directions[hits.rows]))
         return result
 
     return shade
 
 
 def _layer_at(
-    model: NeilfModel, layer: str, hits: Intersections, wo: Float[Tensor, "K 3"]
+    subject: Subject, layer: str, hits: Intersections, wo: Float[Tensor, "K 3"]
 ) -> Float[Tensor, "K 3"]:
     """Values of a layer at hits of the surface that are seen from the directions wo."""
+    model = subject.run.model
     if layer == "normal":
         return hits.normal
+    if layer in ERROR_LAYERS:
+        errors = subject.expected_errors.at(hits.position, hits.normal)
+        return errors[:, ERROR_LAYERS.index(layer), None].expand(-1, 3)
     material = model.materials(hits.position)
     if layer == "pbr":
         return model.shade(hits.position, hits.normal, wo, material, model.config.shading.eval_samples).color
@@ -183,6 +187,8 @@ def _image(
     straight = (values[:, :3] / alpha.clamp_min(1e-6)).view(*shape, 3).numpy()
     if request.layer in ("pbr", "radiance"):
         image = display_color(straight, 2.0**request.exposure)
+    elif request.layer in ERROR_LAYERS:
+        image = display_error(straight[..., 0], LARGEST_ERROR)
     elif request.layer in ("roughness", "metallic"):
         image = display(request.layer, straight[..., :1]).repeat(3, -1)
     else:

@@ -29,7 +29,7 @@ from neilfpp_method.view.incident_map import SurfacePoint, light_at, light_pictu
 from neilfpp_method.view.painter import Painter
 from neilfpp_method.view.pictures import PictureRequest, ViewerFrame, frames
 from neilfpp_method.view.speed import RenderSpeed
-from neilfpp_method.view.subject import LAYERS, Lighting, Subject, own_light
+from neilfpp_method.view.subject import ERROR_LAYERS, LAYERS, Lighting, Subject, own_light
 
 __all__ = ["Session", "Shared"]
 
@@ -200,6 +200,8 @@ class Session:
         """Request images for the present camera and controls."""
         camera = self.client.camera
         pose = Pose(camera.position, camera.wxyz, camera.fov, camera.aspect)
+        if KEYS[self.layer.value] in ERROR_LAYERS and not self.subject.has_expected_errors:
+            self.status.content = "Computing the expected errors of the material; this takes some seconds."
         self.painter.request(
             PictureRequest(
                 subject=self.subject,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -16,8 +17,9 @@ from neilfpp_method.relight.recovered import surface_of_run
 from neilfpp_method.relight.sky import Sky, sky_of_run
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.train.run import Run
+from neilfpp_method.view.confidence import ExpectedErrors, expected_errors
 
-__all__ = ["LAYERS", "Lighting", "Subject", "own_light", "scene_of", "subject_of"]
+__all__ = ["ERROR_LAYERS", "LAYERS", "Lighting", "Subject", "own_light", "scene_of", "subject_of"]
 
 LAYERS = {
     "pbr": "PBR",
@@ -26,10 +28,17 @@ LAYERS = {
     "roughness": "roughness",
     "metallic": "metallic",
     "normal": "normal",
+    "base_color_error": "expected error of base colour",
+    "roughness_error": "expected error of roughness",
+    "metallic_error": "expected error of metallic",
 }
 """Layers by name, with their titles on the page."""
-MATERIAL_LAYERS = {"pbr", "base_color", "roughness", "metallic"}
+ERROR_LAYERS = ("base_color_error", "roughness_error", "metallic_error")
+"""Layers with the expected error of the material, in the order of the columns of `ExpectedErrors.values`."""
+MATERIAL_LAYERS = {"pbr", "base_color", "roughness", "metallic", *ERROR_LAYERS}
 """Layers that need a material."""
+SPECULAR_LAYERS = {"roughness_error", "metallic_error"}
+"""Layers that mean nothing if surfaces are Lambertian."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +65,25 @@ class Subject:
         """Names of the layers that can be shown."""
         if self.surface is None:
             return ("radiance",)
-        return tuple(name for name in LAYERS if self.run.has_material or name not in MATERIAL_LAYERS)
+        missing = set() if self.run.has_material else MATERIAL_LAYERS
+        if not self.run.config.shading.specular:
+            missing = missing | SPECULAR_LAYERS
+        return tuple(name for name in LAYERS if name not in missing)
+
+    @cached_property
+    def expected_errors(self) -> ExpectedErrors:
+        """Expected errors of the material, computed when they are first asked for; needs a surface.
+
+        Raises:
+            UserError: a training view cannot be read.
+        """
+        assert self.surface is not None
+        return expected_errors(self.run, self.surface)
+
+    @property
+    def has_expected_errors(self) -> bool:
+        """Whether the expected errors have been computed."""
+        return "expected_errors" in self.__dict__
 
 
 @dataclass(frozen=True)
