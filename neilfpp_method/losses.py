@@ -26,6 +26,13 @@ __all__ = [
     "surface",
 ]
 
+MISS = 0.02
+"""Distance by which a ray misses the object, scene units, at which its mask loss grows by 1."""
+TINY_DEPTH = 1e-12
+"""Optical depths are raised to at least this value, so that the gradient of their logarithm is finite. A ray
+that misses the surface by 28 β has it.
+"""
+
 
 def photometric(
     radiance: Float[Tensor, "N 3"], pixel: Float[Tensor, "N 3"], response: str, unit: float = 1.0
@@ -45,25 +52,30 @@ def photometric(
 
 
 def mask(
-    opacity: Float[Tensor, " N"],
     depth: Float[Tensor, " N"],
     object_mask: Float[Tensor, " N"],
     known: Float[Tensor, " N"],
+    beta: Float[Tensor, ""],
 ) -> LossTerm:
-    """Mask loss: 1 − opacity on the object and ln(1 + τ) off it, where τ is the optical depth of the ray.
+    """Mask loss: ln(1 + τ) off the object, and e^−τ + β/d ln(1 + 1/τ) on it, with d = `MISS`.
 
-    Off the object, a loss on the opacity 1 − e^−τ would have no gradient behind a solid surface: geometry in
-    known empty space would stay and be painted like the background. The cross-entropy of IDR equals τ there;
-    its gradient grows without bound as surfaces become sharp, and masks that are wrong by a pixel along the
-    silhouettes would carve the object.
+    τ is the optical depth of the ray. A loss on the opacity 1 − e^−τ alone has no gradient where it is wrong:
+
+    - Off the object, behind a solid surface. Geometry in known empty space would stay and be painted like the
+      background. The cross-entropy of IDR equals τ there; its gradient grows without bound as surfaces become
+      sharp, and masks that are wrong by a pixel along the silhouettes would carve the object.
+    - On the object, where a ray misses the surface by more than a few β. Parts of the object that have shrunk
+      would stay so. The density is e^(−distance/β) there, so that −β ln τ is the distance up to a constant.
 
     Args:
-        opacity: opacity of each ray.
         depth: optical depth τ of each ray.
         object_mask: 1 on the object, 0 off it.
         known: 1 where the mask is known; the loss is 0 elsewhere.
+        beta: scale β of the density, scene units.
     """
-    return LossTerm(known * (object_mask * (1 - opacity) + (1 - object_mask) * depth.log1p()))
+    missed = beta / MISS * functional.softplus(-depth.clamp_min(TINY_DEPTH).log())
+    on_object, off_object = torch.exp(-depth) + missed, depth.log1p()
+    return LossTerm(known * (object_mask * on_object + (1 - object_mask) * off_object))
 
 
 def exposure(drift: Float[Tensor, "V 3"]) -> LossTerm:

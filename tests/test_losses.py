@@ -56,19 +56,39 @@ def test_lambertian_is_zero_for_a_rough_dielectric_only():
     ).values.item() == pytest.approx(1.25)
 
 
+BETA = torch.tensor(0.002)
+"""Scale of the density, scene units."""
+
+
 def test_mask_loss_counts_only_known_pixels():
-    opacity, depth = torch.full((4,), 0.75), torch.full((4,), math.e - 1)
-    term = losses.mask(
-        opacity, depth, torch.tensor([1.0, 0.0, 1.0, 0.5]), known=torch.tensor([1.0, 1.0, 0.0, 1.0])
-    )
-    assert term.values.tolist() == pytest.approx([0.25, 1.0, 0.0, 0.625])
+    depth = torch.full((4,), math.e - 1)
+    on_object, known = torch.tensor([1.0, 0.0, 1.0, 0.5]), torch.tensor([1.0, 1.0, 0.0, 1.0])
+    term = losses.mask(depth, on_object, known, beta=torch.tensor(losses.MISS))
+    on_it = math.exp(1 - math.e) + math.log1p(1 / (math.e - 1))
+    assert term.values.tolist() == pytest.approx([on_it, 1.0, 0.0, (1 + on_it) / 2])
 
 
 def test_the_gradient_of_the_mask_loss_is_nonzero_and_bounded():
     depth = torch.tensor([0.0, 0.1, 10.0, 1e4], requires_grad=True)
-    opacity = -torch.expm1(-depth)
-    losses.mask(opacity, depth, torch.zeros(4), torch.ones(4)).values.sum().backward()
+    losses.mask(depth, torch.zeros(4), torch.ones(4), BETA).values.sum().backward()
     assert depth.grad.tolist() == pytest.approx([1.0, 1 / 1.1, 1 / 11, 1e-4], rel=1e-3)
+
+
+def test_the_mask_loss_pulls_the_surface_to_rays_that_miss_it():
+    """The gradient per distance is the same for a miss by 5 β and by 20 β, where the opacity is 2e-9."""
+    missed_by = torch.tensor([5.0, 20.0], dtype=torch.float64) * BETA
+    depth = (-missed_by.requires_grad_() / BETA).exp()
+    term = losses.mask(depth, torch.ones(2), torch.ones(2), BETA)
+    (gradient,) = torch.autograd.grad(term.values.sum(), missed_by)
+    assert gradient.tolist() == pytest.approx([1 / losses.MISS] * 2, rel=0.1)
+
+
+def test_the_mask_loss_is_finite_without_any_density():
+    depth = torch.zeros(1, requires_grad=True)
+    term = losses.mask(depth, torch.ones(1), torch.ones(1), BETA)
+    term.values.sum().backward()
+    assert term.values.isfinite().all()
+    assert depth.grad.isfinite().all()
 
 
 def test_scale_gradient_keeps_the_value():

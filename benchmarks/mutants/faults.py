@@ -205,8 +205,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "mask loss: object and background swapped",
         "losses.py",
-        "(object_mask * (1 - opacity) + (1 - object_mask)",
-        "((1 - object_mask) * (1 - opacity) + object_mask",
+        "object_mask * on_object + (1 - object_mask) * off_object",
+        "object_mask * off_object + (1 - object_mask) * on_object",
         "test_losses.py",
     ),
     Mutant(

@@ -369,15 +369,14 @@ class VolSdfHost(nn.Module):
             sample = self.sdf_field.with_gradient(drawn.position)
             terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, drawn.normal)
         if "mask" in names:
-            terms["mask"] = losses.mask(
-                march.hits.opacity, self._depth_of_object(march), batch.mask, batch.mask_known
-            )
+            terms["mask"] = self._mask_loss(march, batch)
         return terms
 
-    def _depth_of_object(self, march: March) -> Float[Tensor, " N"]:
-        """Optical depth of rays, with β detached: the mask loss must move surfaces, not widen them."""
-        distance = march.surface.distance.view_as(march.distances)
-        return laplace_depth(distance, march.distances, self.density.beta().detach()).sum(-1)
+    def _mask_loss(self, march: March, batch: PixelBatch) -> LossTerm:
+        """The mask loss, with β detached: it must move surfaces, not widen them."""
+        beta, distance = self.density.beta().detach(), march.surface.distance.view_as(march.distances)
+        depth = laplace_depth(distance, march.distances, beta).sum(-1)
+        return losses.mask(depth, batch.mask, batch.mask_known, beta)
 
     def _regularizer_inputs(self, march: March) -> RegularizerInputs:
         """Inputs of the regularisers of G, at the points that `loss.points` names."""

@@ -145,7 +145,7 @@ FAST: Mapping[str, Any] = {
     "loss.surface": 1e-2,
     "loss.surface_joint": 1e-3,
     "loss.point_cloud": 0.1,
-    "loss.mask": 0.1,
+    "loss.mask": 1.0,
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,
     "loss.position_gradient": 0.0,

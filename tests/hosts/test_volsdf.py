@@ -168,7 +168,25 @@ def test_a_mask_removes_a_solid_in_empty_space(background):
             push += host.sdf(at)
             parameter.copy_(before)
     assert push.min() > 1e-4
-    assert host.density.above_floor.grad == 0.0
+    assert host.density.above_floor.grad is None
+
+
+def test_a_mask_brings_the_surface_back_to_rays_that_miss_it():
+    """Their opacity is 0 in single precision; a step along the gradient must bring the surface closer."""
+    host = thin_surface()
+    batch = sphere_batch(32, spread=0.0)
+    beside = torch.linspace(0.0, 1.5, 1500)[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    nearest = beside[(host.sdf(beside) > 0.03).nonzero()[0, 0]]
+    missing = dataclasses.replace(batch, origins=batch.origins + nearest, mask_known=torch.ones(32))
+    rendered = host.render_regularized(missing, ["mask"])
+    assert rendered.hits.opacity.max() < 1e-4
+    rendered.terms["mask"].mean().backward()
+    with torch.no_grad():
+        before = host.sdf(nearest[None])
+        for parameter in host.sdf_field.parameters():
+            parameter -= 1e-4 * parameter.grad
+        assert host.sdf(nearest[None]) < before - 1e-4
+    assert host.density.above_floor.grad is None
 
 
 def test_the_loss_of_a_point_cloud_is_its_distance():
