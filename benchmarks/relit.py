@@ -43,14 +43,14 @@ from neilfpp_method.relight.edits import Materials
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.maps import read_map
 from neilfpp_method.relight.path_tracer import Scene
-from neilfpp_method.relight.recovered import check_material, surface_of_run
+from neilfpp_method.relight.recovered import surface_of_run
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.brdf import LOBES
 from neilfpp_method.structures import Material
 from neilfpp_method.train.device import pick_device
-from neilfpp_method.train.run import Run, load_run
+from neilfpp_method.train.run import Run, check_material, load_run
 
 __all__ = ["true_materials", "true_surface"]
 

@@ -11,9 +11,9 @@ from neilfpp_method.export.surface_cache import shaded_surface, shading_normals
 from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.relight.surface import Surface
-from neilfpp_method.train.run import Run, check_material
+from neilfpp_method.train.run import Run
 
-__all__ = ["check_material", "surface_of_run"]
+__all__ = ["surface_of_run"]
 
 
 @torch.no_grad()
