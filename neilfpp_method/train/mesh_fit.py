@@ -54,7 +54,7 @@ def measure_mesh_fit(host: MeshHost, pixels: PixelDataset) -> MeshFit:
     meets = torch.zeros_like(batch.mask, dtype=torch.bool)
     meets[host.intersect(batch.rays).rows] = True
     # Some views may have no mask. If the background is recognised by its colour, only its pixels are known.
-    known = torch.isin(batch.view, batch.view[batch.mask_known > 0.5])
+    known = torch.isin(batch.view, batch.view[batch.mask_known > 0])
     inside = batch.mask > 0.5
     shared, either = ((both & known).sum().item() for both in (meets & inside, meets | inside))
     return MeshFit(meets.float().mean().item(), shared / either if either else None)

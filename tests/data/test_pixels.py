@@ -16,7 +16,7 @@ from neilfpp_method.data.backdrop import border_color, border_colors, border_med
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_exr, write_png
 from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels import BACKGROUND_TRUST, PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import tone_map
@@ -334,13 +334,13 @@ def test_exact_background_pixels_are_off_the_object(tmp_path: Path) -> None:
     for i in range(6):
         view = pixels.view(i)
         background = (view.color == view.color[0]).all(dim=-1)
-        assert torch.equal(view.mask_known.bool(), background)
+        assert torch.equal(view.mask_known, BACKGROUND_TRUST * background)
         assert torch.equal(view.mask.bool(), ~background)
 
 
 def test_a_mask_file_is_known_everywhere(tmp_path: Path) -> None:
     capture = load_capture(make_capture(tmp_path, masks=True))
-    assert PixelDataset(capture, capture.views).view(0).mask_known.all()
+    assert (PixelDataset(capture, capture.views).view(0).mask_known == 1).all()
 
 
 def test_exact_pixels_are_those_of_the_files(tmp_path: Path) -> None:
