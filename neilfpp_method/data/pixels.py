@@ -30,8 +30,8 @@ MIDDLE_GRAY = 0.18
 """Linear value to which the median of the object is brought for image gradients: photographic middle grey."""
 
 BACKGROUND_TRUST = 0.1
-"""`mask_known` of pixels whose mask is known only because they have exactly the background colour. The object
-may have that colour, too: with 1, normals of `tabletop_mix` were 4.7° off instead of 3.6°.
+"""`mask_known` of pixels whose mask is known only because they have exactly the background colour. It is low
+because parts of the object may have that colour as well.
 """
 
 MAX_COUNTED = 2**20
