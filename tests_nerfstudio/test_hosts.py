@@ -32,8 +32,8 @@ from tests_nerfstudio.runs import checkpoint, ns_train, small_settings, trainer_
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measurements with few rays: NeuS takes half a minute for 512 rays on a busy core."""
-    monkeypatch.setattr(proxy, "ROUNDS", 1)
-    monkeypatch.setattr(proxy, "ROUND", 16)
+    monkeypatch.setattr(proxy, "EXPLORING_BATCHES", 1)
+    monkeypatch.setattr(proxy, "EXPLORING_RAYS", 16)
     monkeypatch.setattr(plugin_model, "CHECKED_PIXELS", 16)
 
 

@@ -89,7 +89,7 @@ def test_bad_options_are_refused(given, tmp_path, capfd, options, words):
 def test_a_run_without_a_material(masked_capture, tmp_path, capfd):
     run = train_tiny(masked_capture, tmp_path / "run")
     command = ["export", run, "--what", "asset", "--checkpoint", "sdf_init", *SMALL]
-    refused(capfd, command, "no material yet at step 4", leaves=tmp_path)
+    refused(capfd, command, "no material at step 4", leaves=tmp_path)
     # A later step has a material, on the recovered surface; the light is free at every point, so there is
     # no map.
     assert main(["export", str(run), "--what", "asset", *SMALL]) == 0
