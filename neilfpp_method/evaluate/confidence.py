@@ -41,6 +41,7 @@ from neilfpp_method.train.run import Run
 __all__ = [
     "DISPLAY_STEP",
     "TrainingResiduals",
+    "coordinates",
     "deviations_at",
     "material_deviation",
     "measure_residuals",
@@ -212,6 +213,14 @@ def surface_at_pixels(run: Run, view: RenderedView, pixels: Int[np.ndarray, " P"
     return points.to(run.device)
 
 
+def coordinates(position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]) -> Float[np.ndarray, "N 6"]:
+    """Coordinates for the search of neighbours: positions, scene frame, and `TURN` times the unit normals.
+
+    The two sides of a thin plate are far from each other in them.
+    """
+    return torch.cat((position, TURN * normal), -1).cpu().numpy()
+
+
 def _smoothed(
     deviation: Deviation, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
 ) -> Deviation:
@@ -220,9 +229,8 @@ def _smoothed(
     Directions are sampled for each point separately, so single values are noisy. Also, the material is a
     continuous field: views of neighbouring points constrain a point that its own views do not.
     """
-    coordinates = torch.cat((position, TURN * normal), -1).cpu().numpy()
-    tree = cKDTree(coordinates)
-    nearest = tree.query(coordinates, k=range(1, 1 + NEIGHBORS), distance_upper_bound=NEAR)[1]
+    places = coordinates(position, normal)
+    nearest = cKDTree(places).query(places, k=range(1, 1 + NEIGHBORS), distance_upper_bound=NEAR)[1]
     # If a point has fewer neighbours, the tree returns the index after the last row; that row is padded
     # with NaN here, which nanmedian ignores.
     values = (

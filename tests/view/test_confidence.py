@@ -6,13 +6,13 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from neilfpp_method.evaluate.confidence import deviations_at
+from neilfpp_method.evaluate.confidence import coordinates, deviations_at
 from neilfpp_method.relight.cameras import turntable
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.structures import OrientedPoints
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view import confidence
-from neilfpp_method.view.confidence import TURN, ExpectedErrors, points_on
+from neilfpp_method.view.confidence import ExpectedErrors, points_on
 from neilfpp_method.view.pictures import LARGEST_ERROR, PictureRequest, frames
 from neilfpp_method.view.speed import RenderSpeed
 from neilfpp_method.view.subject import ERROR_LAYERS, own_light, subject_of
@@ -34,7 +34,7 @@ def test_errors_are_those_of_the_near_points_of_the_same_side():
     grid = torch.cartesian_prod(torch.linspace(-1, 1, 20), torch.linspace(-1, 1, 20), torch.zeros(1))
     position, normal = grid.repeat(2, 1), side.repeat_interleave(len(grid), 0)
     values = torch.cat((torch.full((len(grid), 3), 0.1), torch.full((len(grid), 3), 0.4)))
-    errors = ExpectedErrors(cKDTree(torch.cat((position, TURN * normal), -1).numpy()), values)
+    errors = ExpectedErrors(cKDTree(coordinates(position, normal)), values)
     x = torch.rand(50, 3) * torch.tensor([1.8, 1.8, 0.0]) - torch.tensor([0.9, 0.9, 0.0])
     torch.testing.assert_close(errors.at(x, side[:1].expand(50, 3)), torch.full((50, 3), 0.1))
     torch.testing.assert_close(errors.at(x, side[1:].expand(50, 3)), torch.full((50, 3), 0.4))
