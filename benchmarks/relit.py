@@ -33,8 +33,8 @@ from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.mesh import Mesh
+from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.relight.comparison import RelitComparison, compare, find_truth, read_truth

@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.environment_map import read_environment
-from neilfpp_method.data.views import Camera
 from neilfpp_method.effects.place_solver import PlaceSolver
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
@@ -179,7 +179,7 @@ class AttachedNeilf(nn.Module):
         if isinstance(rays, Camera):
             if not isinstance(self.model.host, ForeignHost):
                 raise UserError(
-                    f"{host_name(self.model.host)} takes rays", "give data.views.camera_rays(camera)"
+                    f"{host_name(self.model.host)} takes rays", "give data.projection.camera_rays(camera)"
                 )
             camera, rays = rays, rays_like(rays, next(self.model.brdf.parameters()))
             with torch.no_grad():

@@ -21,7 +21,7 @@ from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.views import camera_rays, project
+from neilfpp_method.data.projection import camera_rays, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, to_pixel_batch
 from neilfpp_method.plugin.dataparser import CaptureParserConfig, capture_of

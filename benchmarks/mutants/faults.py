@@ -297,7 +297,7 @@ MUTANTS: Sequence[Mutant] = (
     # Readers.
     Mutant(
         "the camera's centre has the wrong sign",
-        "data/views.py",
+        "data/camera.py",
         "-rotation @ self.w2c[:3, 3:]",
         "rotation @ self.w2c[:3, 3:]",
         "data/test_capture.py",
@@ -311,21 +311,21 @@ MUTANTS: Sequence[Mutant] = (
     ),
     Mutant(
         "paths may leave the capture",
-        "data/views.py",
+        "data/paths.py",
         "if path.resolve().is_relative_to(root.resolve()):",
         "if True:",
         "hard_cases/test_captures.py",
     ),
     Mutant(
         "mirrored cameras are accepted",
-        "data/views.py",
+        "data/camera.py",
         "if np.linalg.det(rotation) < 0:",
         "if np.linalg.det(rotation) < -2:",
         "hard_cases/test_captures.py",
     ),
     Mutant(
         "cameras whose rays overflow float32 are accepted",
-        "data/views.py",
+        "data/camera.py",
         "if min(camera.fx, camera.fy) < MIN_FOCAL or",
         "if False and",
         "hard_cases/test_captures.py",

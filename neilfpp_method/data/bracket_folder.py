@@ -16,9 +16,9 @@ from jaxtyping import Float32
 from neilfpp_method.data.bracket_alignment import Aligned, align
 from neilfpp_method.data.brackets import Bracket, Response, calibrate, linear_response, merge, srgb_response
 from neilfpp_method.data.images import IMAGE_SUFFIXES, read_image, write_exr, write_png
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.photo_exposure import exposures_of
 from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
-from neilfpp_method.data.views import inside
 from neilfpp_method.errors import UserError
 
 __all__ = ["GROUPS", "Brackets", "find_brackets", "merge_brackets"]

@@ -11,9 +11,11 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.json_entry import Entry, write_json
 from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.views import Camera, CaptureFiles, Normalization, SceneSource, View, inside
+from neilfpp_method.data.paths import inside
+from neilfpp_method.data.views import CaptureFiles, Normalization, SceneSource, View
 from neilfpp_method.errors import UserError
 
 __all__ = ["FILE", "LAYOUT", "Writable", "read", "read_scene", "recognize", "write_capture"]

@@ -15,7 +15,8 @@ from jaxtyping import Float
 from scipy import ndimage
 from torch import Tensor
 
-from neilfpp_method.data.views import Camera, pixel_index, project, scaled_camera
+from neilfpp_method.data.camera import Camera, scaled_camera
+from neilfpp_method.data.projection import pixel_index, project
 from neilfpp_method.data.visual_hull import (
     MIN_CELLS,
     MIN_SEEN_SHARE,

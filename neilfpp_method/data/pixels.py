@@ -16,7 +16,8 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.drawing import KNOWN, MASK, NEAR, VALID, PixelDraws, PixelSet
 from neilfpp_method.data.image_gradient import NEIGHBORS, image_gradient, scharr
 from neilfpp_method.data.pixel_store import PixelStore, advise_random_access, load_pixels
-from neilfpp_method.data.views import CameraRays, View
+from neilfpp_method.data.projection import CameraRays
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import luminance, srgb_to_linear, tone_map
 from neilfpp_method.structures import PixelBatch

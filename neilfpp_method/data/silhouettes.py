@@ -10,8 +10,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 
+from neilfpp_method.data.camera import scaled_camera
 from neilfpp_method.data.images import read_image
-from neilfpp_method.data.views import View, pixel_index, project, scaled_camera
+from neilfpp_method.data.projection import pixel_index, project
+from neilfpp_method.data.views import View
 
 __all__ = [
     "AGREEMENT",

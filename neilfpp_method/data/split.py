@@ -6,7 +6,8 @@ import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from neilfpp_method.data.views import CaptureFiles, View, inside
+from neilfpp_method.data.paths import inside
+from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
 
 __all__ = ["check_test_every", "every_kth", "held_out_views"]

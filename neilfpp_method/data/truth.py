@@ -25,8 +25,9 @@ from torch import Tensor
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.mesh import Mesh, read_mesh
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scaling import area_average, area_share, file_size, nearest
-from neilfpp_method.data.views import View, inside
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
 

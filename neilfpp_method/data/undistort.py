@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.colmap_library import pycolmap
-from neilfpp_method.data.views import Camera
 
 __all__ = ["resample", "straight_camera"]
 

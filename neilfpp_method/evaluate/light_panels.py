@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import camera_rays
 from neilfpp_method.evaluate.pictures import (
     Group,
     PictureRow,

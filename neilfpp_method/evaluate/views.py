@@ -12,8 +12,9 @@ from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.projection import camera_rays, pixel_index, project
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import View, camera_rays, pixel_index, project
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.shading.color import srgb_to_linear

@@ -12,7 +12,7 @@ from collections.abc import Collection
 import torch
 from torch import Tensor, nn
 
-from neilfpp_method.data.views import Camera
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import HasRadiance, ImageHost, RegularizedHits, TracesLight
 from neilfpp_method.hosts.conversion import as_hits, given_depth, no_hits
@@ -122,7 +122,7 @@ class ForeignHost(nn.Module):
         """
         if not isinstance(self.inner, ImageHost):
             raise UserError(
-                f"{self.name} has no render_image(camera)", "give rays: data.views.camera_rays(camera)"
+                f"{self.name} has no render_image(camera)", "give rays: data.projection.camera_rays(camera)"
             )
         return self.read(rays, self.inner.render_image(camera))
 

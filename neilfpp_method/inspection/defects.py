@@ -129,10 +129,10 @@ def inspect_capture(capture: Capture, on_view: Callable[[str], None] = lambda na
     factors = tuple(exposure_factors([view.luminance for view in views], placement).tolist())
     outlines = [view.outline for view in views if view.outline is not None]
     defects = (
-        *_of_masks(outlines),
-        *_of_views(views, factors, capture),
-        *_of_cameras(capture, placement),
-        *_of_scene(capture),
+        *_mask_defects(outlines),
+        *_view_defects(views, factors, capture),
+        *_camera_defects(capture, placement),
+        *_scene_defects(capture),
     )
     radiance = radiance_quality(views, capture.hdr, {defect.kind for defect in defects})
     order = {"problem": 0, "warning": 1}
@@ -147,13 +147,13 @@ def problems(inspection: Inspection) -> tuple[str, ...]:
 
 def problems_of_poses(capture: Capture) -> tuple[str, ...]:
     """The same as `problems`, for cameras and point cloud only; fast, because no image is read."""
-    found = (*_of_cameras(capture, camera_placement(capture)), *_of_scene(capture))
+    found = (*_camera_defects(capture, camera_placement(capture)), *_scene_defects(capture))
     return _lines_of_problems(found)
 
 
 def problems_of_masks(outlines: Sequence[Outline]) -> tuple[str, ...]:
     """The same as `problems`, for masks that have been read already."""
-    return _lines_of_problems(tuple(_of_masks(outlines)))
+    return _lines_of_problems(tuple(_mask_defects(outlines)))
 
 
 def _lines_of_problems(defects: Sequence[Defect]) -> tuple[str, ...]:
@@ -178,15 +178,17 @@ def views_to_leave_out(inspection: Inspection) -> Mapping[str, str]:
     }
 
 
-def _of_views(views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture) -> Iterator[Defect]:
-    yield from _of_files(views)
-    yield from _of_exposures(views, factors, capture)
+def _view_defects(
+    views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture
+) -> Iterator[Defect]:
+    yield from _file_defects(views)
+    yield from _exposure_defects(views, factors, capture)
     readable = [view for view in views if not view.unreadable]
-    yield from _of_pictures(readable)
-    yield from _of_values(readable, capture)
+    yield from _image_defects(readable)
+    yield from _value_defects(readable, capture)
 
 
-def _of_masks(outlines: Sequence[Outline]) -> Iterator[Defect]:
+def _mask_defects(outlines: Sequence[Outline]) -> Iterator[Defect]:
     """Masks of the surroundings instead of the object."""
     if outlines and look_inverted(outlines):
         text = "the masks look inverted: they are black on the object and white around it"
@@ -194,7 +196,7 @@ def _of_masks(outlines: Sequence[Outline]) -> Iterator[Defect]:
         yield Defect("inverted_masks", "problem", text, remedy)
 
 
-def _of_files(views: Sequence[ViewFigures]) -> Iterator[Defect]:
+def _file_defects(views: Sequence[ViewFigures]) -> Iterator[Defect]:
     """Files that hold no usable image."""
     if damaged := [view for view in views if view.unreadable]:
         text, remedy = damaged[0].unreadable, "export these images again, or leave them out"
@@ -210,7 +212,7 @@ def _of_files(views: Sequence[ViewFigures]) -> Iterator[Defect]:
         yield Defect("black", "problem", text, remedy, _names(black))
 
 
-def _of_exposures(
+def _exposure_defects(
     views: Sequence[ViewFigures], factors: Sequence[float], capture: Capture
 ) -> Iterator[Defect]:
     """Views that are brighter or darker than the views around them."""
@@ -224,7 +226,7 @@ def _of_exposures(
         yield Defect("exposure_jump", "problem", text, own if capture.hdr else alike, tuple(jumps))
 
 
-def _of_pictures(views: Sequence[ViewFigures]) -> Iterator[Defect]:
+def _image_defects(views: Sequence[ViewFigures]) -> Iterator[Defect]:
     """Pictures that add nothing: blurred ones and duplicates."""
     sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
     if blurred := [view for view in views if 0 < view.sharpness < BLURRED * sharp]:
@@ -237,7 +239,7 @@ def _of_pictures(views: Sequence[ViewFigures]) -> Iterator[Defect]:
         yield Defect("duplicate", "warning", f"the same picture twice: {named}", "keep one of each", again)
 
 
-def _of_values(views: Sequence[ViewFigures], capture: Capture) -> Iterator[Defect]:
+def _value_defects(views: Sequence[ViewFigures], capture: Capture) -> Iterator[Defect]:
     """Pixel values that carry too little information."""
     if clipped := [view for view in views if view.clipped > CLIPPED_VIEW]:
         worst = max(clipped, key=lambda view: view.clipped)
@@ -263,7 +265,7 @@ def _listed(parts: Sequence[str], max_parts: int) -> str:
     return ", ".join(parts[:max_parts]) + ("…" if len(parts) > max_parts else "")
 
 
-def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Defect]:
+def _camera_defects(capture: Capture, placement: CameraPlacement) -> Iterator[Defect]:
     """Cameras that see the wrong thing, are too few, or are too close to or too far from each other."""
     names = np.array([view.name for view in capture.views])
     if placement.away.any():
@@ -292,7 +294,7 @@ def _of_cameras(capture: Capture, placement: CameraPlacement) -> Iterator[Defect
         yield Defect("sparse", "warning", text, f"add views between them, at most {SPARSE_GAP:.0f}° apart")
 
 
-def _of_scene(capture: Capture) -> Iterator[Defect]:
+def _scene_defects(capture: Capture) -> Iterator[Defect]:
     """A scene box without a reliable source, and a point cloud that is damaged or does not fit the box."""
     if capture.scene_from == "cameras":
         text = "position and size of the scene are guessed from the cameras only"

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 
 __all__ = ["CameraPlacement", "camera_placement", "duplicates", "exposure_factors"]
 

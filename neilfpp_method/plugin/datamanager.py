@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neilfpp_method.data import drawing
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.views import CameraRays
+from neilfpp_method.data.projection import CameraRays
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.dataparser import capture_of
 from neilfpp_method.structures import PixelBatch

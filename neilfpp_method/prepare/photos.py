@@ -14,9 +14,9 @@ from PIL import Image
 
 from neilfpp_method.data.formats.places import view_names
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header, read_image
+from neilfpp_method.data.paths import plain_name
 from neilfpp_method.data.photo_exposure import photo_exposure
 from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
-from neilfpp_method.data.views import plain_name
 from neilfpp_method.errors import UserError
 
 __all__ = [

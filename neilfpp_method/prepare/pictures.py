@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.point_cloud import WorldPoints
-from neilfpp_method.data.views import Camera, Normalization, View
+from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.prepare.summary import Placement
 
 __all__ = ["draw_fit", "draw_scene", "write_picture"]

@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
 
+from neilfpp_method.data.camera import Camera, scaled_camera
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.undistort import resample, straight_camera
-from neilfpp_method.data.views import Camera, Normalization, View, scaled_camera
+from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.shading.color import luminance
 
 __all__ = ["GrayView", "choose_sources", "gray_view", "inverse_depth_step", "sweep"]

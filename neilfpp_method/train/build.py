@@ -15,8 +15,8 @@ from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
+from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import camera_rays
 from neilfpp_method.effects.exposure import Exposures, measure_exposures
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import Host

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.focus import find_focus
 from neilfpp_method.data.inverted_masks import look_inverted
 from neilfpp_method.data.silhouettes import Outline
-from neilfpp_method.data.views import Camera, View
+from neilfpp_method.data.views import View
 from tests.data.make_capture import CENTER, DISTANCE, RADIUS, camera_pose
 
 VIEWS, WIDTH, HEIGHT = 12, 64, 48

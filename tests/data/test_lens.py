@@ -10,9 +10,10 @@ import pycolmap
 import pytest
 import torch
 
+from neilfpp_method.data.camera import Camera, check_camera
 from neilfpp_method.data.lens import LENSES, Lens, lens_of
+from neilfpp_method.data.projection import CameraRays, camera_rays, project
 from neilfpp_method.data.undistort import resample, straight_camera
-from neilfpp_method.data.views import Camera, CameraRays, camera_rays, check_camera, project
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTER, camera_pose
 

@@ -13,6 +13,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.projection import CameraRays, project
 from neilfpp_method.data.scaling import (
     PIXELS_OF_A_RAY,
     PIXELS_OF_A_VIEW,
@@ -24,7 +25,6 @@ from neilfpp_method.data.scaling import (
     scaled_view,
 )
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import CameraRays, project
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import make_capture, radiance, srgb
 

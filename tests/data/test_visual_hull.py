@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.silhouettes import Outline, agreement, read_outlines, sightings
-from neilfpp_method.data.views import Camera, View
+from neilfpp_method.data.views import View
 from neilfpp_method.data.visual_hull import DistanceCube, find_hull, signed_distance, visual_hull
 
 BALL = 0.6

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from neilfpp_method.data.views import Camera, Normalization
+from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.views import Normalization
 from neilfpp_method.prepare.depth_fusion import fuse_depth_maps
 from neilfpp_method.prepare.depth_planes import fit_planes
 from neilfpp_method.prepare.plane_sweep import GrayView, choose_sources, inverse_depth_step, sweep

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.point_cloud import WorldPoints
-from neilfpp_method.data.views import Camera, Normalization, View
+from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.mapping import refuse_partial
 from neilfpp_method.prepare.matching import choose_pairing

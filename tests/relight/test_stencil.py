@@ -10,7 +10,7 @@ import torch
 
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.images import write_png
-from neilfpp_method.data.views import camera_rays
+from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight import stencil
 from neilfpp_method.relight.stencil import masked_limit, read_stencils

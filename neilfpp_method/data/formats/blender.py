@@ -15,8 +15,9 @@ from pathlib import Path
 from neilfpp_method.data.formats.places import stored, view_names
 from neilfpp_method.data.formats.transforms import Frame, read_frames
 from neilfpp_method.data.json_entry import Entry
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scene_box import find_box
-from neilfpp_method.data.views import CaptureFiles, View, inside
+from neilfpp_method.data.views import CaptureFiles, View
 
 __all__ = ["LAYOUT", "read", "recognize"]
 

@@ -19,13 +19,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.formats.colmap_sizes import check_sizes
 from neilfpp_method.data.formats.places import check_masks, stored, stored_image, view_names
 from neilfpp_method.data.lens import PANORAMAS, lens_of
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.point_cloud import read_positions
 from neilfpp_method.data.scene_box import find_box
-from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
+from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
 
 __all__ = ["LAYOUT", "camera_of", "model_folder", "open_model", "read", "recognize"]

@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Float32
 
 from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.undistort import resample, straight_camera
-from neilfpp_method.data.views import Camera, View
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear
 

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from neilfpp_method.data.images import IMAGE_SUFFIXES
-from neilfpp_method.data.views import View, inside
+from neilfpp_method.data.paths import inside
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 
 __all__ = ["check_masks", "stored", "stored_image", "view_names"]

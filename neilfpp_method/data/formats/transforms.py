@@ -27,14 +27,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.capture_folder import read_scene
 from neilfpp_method.data.formats.nerfstudio_lens import COEFFICIENTS, FISHEYE, lens_from_nerfstudio
 from neilfpp_method.data.formats.places import stored, stored_image, view_names
 from neilfpp_method.data.images import image_header
 from neilfpp_method.data.json_entry import Entry
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.point_cloud import has_normals, read_positions
 from neilfpp_method.data.scene_box import SceneBox, find_box
-from neilfpp_method.data.views import Camera, CaptureFiles, View, inside
+from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
 
 __all__ = [

@@ -20,9 +20,10 @@ from jaxtyping import Float
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.data.views import View, inside
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published.protocol import Protocol, missing, no_surface
 from neilfpp_method.evaluate.views import RenderedView

@@ -37,8 +37,9 @@ from jaxtyping import Float
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image
+from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.scaling import file_size
-from neilfpp_method.data.views import View, camera_rays
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.metrics import align_scale, decibels
 from neilfpp_method.evaluate.published.protocol import Protocol, missing

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from neilfpp_method.data.images import ImageFile, read_image
+from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scaling import file_size
-from neilfpp_method.data.views import View, inside
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 
 __all__ = ["alpha_of", "check_full_size", "existing", "read_array", "read_beside"]

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from neilfpp_method.data.views import Camera, CameraRays, pixel_index, project
+from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.projection import CameraRays, pixel_index, project
 from neilfpp_method.export.asset.surface import AssetSurface, first_hits
 
 __all__ = ["visible_faces"]

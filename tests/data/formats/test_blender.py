@@ -11,7 +11,7 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_png
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 from tests.data.formats.scenes import POINTS, VIEWS, WIDTH, local, material, opengl_pose, refused
 from tests.data.make_capture import CENTER, RADIUS
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_png
 from neilfpp_method.data.lens import LENSES, PINHOLES
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 from neilfpp_method.errors import UserError
 from tests.data.formats.scenes import (
     FOCAL,

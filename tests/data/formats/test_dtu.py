@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 from tests.data.formats.scenes import (
     FOCAL,
     POINTS,

@@ -13,7 +13,7 @@ import torch
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 from neilfpp_method.errors import UserError
 from tests.data.formats.scenes import (
     FOCAL,

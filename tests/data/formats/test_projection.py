@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from neilfpp_method.data.capture import READERS, load_capture
 from neilfpp_method.data.lens import LENSES
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,

@@ -13,7 +13,7 @@ import torch
 import trimesh
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.views import project
+from neilfpp_method.data.projection import project
 from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,
