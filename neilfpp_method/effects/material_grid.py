@@ -52,6 +52,11 @@ class BestMaterials:
     metallic: Int[Tensor, " P"]
     loss: Float[Tensor, " P"]
 
+    @property
+    def material(self) -> Material:
+        """The materials with the values of the grids."""
+        return on_grid(self.base_color, self.roughness, self.metallic)
+
     def where(self, keep: Bool[Tensor, " P"], other: BestMaterials) -> BestMaterials:
         """These materials at the places to keep, and the other ones elsewhere."""
         return BestMaterials(

@@ -21,21 +21,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.material_grid import (
-    METALLICS,
-    ROUGHNESSES,
-    best_materials,
-    mean_loss,
-    neighbors,
-    on_grid,
-    outgoing_radiance,
-    relative_error,
-)
+from neilfpp_method.effects.lit_places import METAL, PAINT, LitPlaces, light_up
+from neilfpp_method.effects.material_grid import BestMaterials
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.layered_transport import layers_at, light_layers
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import Material
@@ -44,6 +34,7 @@ __all__ = [
     "SEARCH_AT",
     "SEARCH_SHARE",
     "SearchedMaterial",
+    "found_in",
     "is_search_due",
     "search_materials",
     "teach",
@@ -54,14 +45,6 @@ SEARCH_AT = (1 / 3, 2 / 3)
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
 pixels (measured on `spot_city`: 22 of 105 s).
-"""
-DRAWS = 2
-"""Random directions per texel and pixel."""
-NEIGHBORS_SHARE = 1 / 150
-"""Share of the places whose errors are added when the material of a place is chosen."""
-COLOR_SCALE = 0.2
-"""Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
-of the same look are often of one material.
 """
 MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
@@ -77,10 +60,6 @@ MIN_METAL_ROUGHNESS = 0.2
 """Metal that is smoother than this is kept: it mirrors more detail than a texel of the map and the grid of
 roughness resolve, so the search would underrate it.
 """
-MIN_ROUGHNESS = 0.05
-"""Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
-MIN_BASE_COLOR = 0.02
-"""Base colours are raised to at least this value before their logarithms are compared."""
 MATTE_ROUGHNESS = 0.65
 """Roughness from which metal becomes paint even if another metal would be slightly better."""
 MATTE_RATIO = 1.1
@@ -102,24 +81,20 @@ class SearchedMaterial:
     Attributes:
         position: the points, scene frame.
         material: their material.
-        share: share of the places whose metal becomes paint.
+        share: share of the places at which it differs from that of the field.
     """
 
     position: Float[Tensor, "N 3"]
     material: Material
     share: float
 
-    def summary(self) -> str:
-        """One line for the console."""
-        return f"material search: {self.share:.0%} of the places are paint that was taken for metal"
-
 
 def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
     """Whether materials are searched after `position.step` steps of a stage.
 
-    They never are if the light is no environment map, or if the settings leave out highlights or metals.
+    They never are if the light is no environment map, or if the settings leave out highlights.
     """
-    if model.lobe is None or not model.brdf.metals or not isinstance(model.light, EnvironmentLight):
+    if model.lobe is None or not isinstance(model.light, EnvironmentLight):
         return False
     return position.stage is Stage.MATERIAL_INIT and any(
         position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
@@ -137,42 +112,26 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     Returns:
         Materials at the points that the pixels show.
     """
-    numbers, place = places.place.unique(return_inverse=True)
-    places = Places(len(numbers), place, places.view, places.observed)
-    shared = places.shared_points()
-    current, typical = model.brdf(shared.position), model.facts.median_radiance
-    light = LightModel(model.light, model.lamps)
-    draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]
-    arriving = torch.stack(draws).mean(0)
-    look = COLOR_SCALE * current.base_color.clamp_min(MIN_BASE_COLOR).log()
-    near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
-    loss = _loss_of(current, arriving, places, typical, near)
-    paint, metal = (
-        best_materials(arriving, places, typical, metallics, near)
-        for metallics in (range(1), range(1, len(METALLICS)))
-    )
+    lit = light_up(model, places)
+    current = model.brdf(lit.places.shared_points().position)
+    loss, roughness = lit.loss(current), current.roughness[:, 0]
+    paint, metal = lit.best(PAINT), lit.best(METAL)
     best = metal.where(metal.loss < paint.loss, paint)
-    roughness = current.roughness[:, 0]
     is_matte = (roughness >= MATTE_ROUGHNESS) & (paint.loss < MATTE_RATIO * best.loss)
     chosen = best.where(~is_matte, paint)
-    material = on_grid(chosen.base_color, chosen.roughness, chosen.metallic)
-    is_other = (current.metallic - material.metallic)[:, 0] >= MIN_CHANGE
+    is_other = (current.metallic - chosen.material.metallic)[:, 0] >= MIN_CHANGE
     is_judged = (roughness >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
-    is_better = is_other & is_judged & (chosen.loss < MAX_RATIO * loss)
-    material = _where(is_better[place], material[place], model.brdf(places.observed.position))
-    return SearchedMaterial(places.observed.position, material, is_better.float().mean().item())
+    return found_in(lit, model.brdf, chosen, is_other & is_judged & (chosen.loss < MAX_RATIO * loss))
 
 
-def _loss_of(
-    material: Material, arriving: Float[Tensor, "K N 3"], places: Places, typical: float, near: Tensor
-) -> Float[Tensor, " P"]:
-    """The loss of `best_materials` for given materials, with roughness rounded to the grid."""
-    grid = torch.tensor(ROUGHNESSES, device=near.device).log()
-    number = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)
-    sent = layers_at(arriving, number[places.place])
-    pixel = material[places.place]
-    error = relative_error(outgoing_radiance(sent, pixel.base_color, pixel.metallic), places, typical)
-    return mean_loss(error, places, near)
+@torch.no_grad()
+def found_in(
+    lit: LitPlaces, brdf: BrdfField, best: BestMaterials, is_found: Bool[Tensor, " P"]
+) -> SearchedMaterial:
+    """The materials of some places, and those of the field at all others."""
+    place, position = lit.places.place, lit.places.observed.position
+    material = _where(is_found[place], best.material[place], brdf(position))
+    return SearchedMaterial(position, material, is_found.float().mean().item())
 
 
 def _where(condition: Bool[Tensor, " N"], yes: Material, no: Material) -> Material:

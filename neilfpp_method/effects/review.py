@@ -13,11 +13,12 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.exposure import Exposures
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light
+from neilfpp_method.effects.lit_places import light_up
 from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.material import JUDGED, material_evidence
 from neilfpp_method.effects.material_search import search_materials, teach
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.metals import metals_evidence
+from neilfpp_method.effects.metals import find_metal, metals_evidence, metals_evidence_in
 from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.effects.plan import Decision, Plan
@@ -42,6 +43,7 @@ __all__ = [
     "record_lamps",
     "review_light",
     "review_material",
+    "review_metals",
     "review_surface",
 ]
 
@@ -181,7 +183,31 @@ def improve_material(model: NeilfModel, places: Places) -> str | None:
     searched = search_materials(model, places)
     if searched.share > 0:
         teach(model.brdf, searched)
-    return searched.summary()
+    return f"material search: {searched.share:.0%} of the places are paint that was taken for metal"
+
+
+def review_metals(plan: Plan, model: NeilfModel, places: Places, step: int) -> list[Decision]:
+    """Decide again on metals that are off, under the light of a half-trained model.
+
+    If they are on afterwards, the model uses them, and its BRDF field is trained on the metal that was found.
+
+    Args:
+        plan: the plan to which the decision is added.
+        model: its light is an environment map; see `material_search.is_search_due`.
+        places: places in the training views, with linear radiance.
+        step: number of steps trained so far.
+
+    Returns:
+        The new decision; empty if metals are on, decided otherwise, or shown by too few places.
+    """
+    if model.brdf.metals or not plan.is_open("metals") or places.shown_count < MIN_PLACES:
+        return []
+    lit = light_up(model, places)
+    decision = plan.decide("metals", metals_evidence_in(lit, model.facts.response), step)
+    if decision.on:
+        model.use(plan.config)
+        teach(model.brdf, find_metal(lit, model.brdf))
+    return [decision]
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.material_search import is_search_due
+from neilfpp_method.effects.places import Places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
@@ -21,6 +22,7 @@ from neilfpp_method.effects.review import (
     record_lamps,
     review_light,
     review_material,
+    review_metals,
     review_surface,
 )
 from neilfpp_method.model import NeilfModel
@@ -94,21 +96,32 @@ def _start_light(run: Training, step: int) -> None:
 
 
 def search_material(run: Training, position: StagePosition, step: int) -> None:
-    """When it is due, search for paint taken for metal, and train the BRDF field on it.
+    """When it is due, search for paint taken for metal, or review metals that are off (`effects.review`).
 
-    The first process does this for all.
+    Both may train the BRDF field. The first process does this for all.
     """
     model, max_pixels = run.model, _max_light_pixels(run)
     if max_pixels < MIN_PIXELS or not is_search_due(model, position):
         return
+    decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         with timed("light_fits", undivided=True):
             seed_stream(run.config.train.seed, Stream.SEARCH, step)
-            summary = improve_material(model, light_places(model, run.pixels, max_pixels))
-        if summary is not None:
-            run.reporter.say(summary)
+            decisions = _search_at(light_places(model, run.pixels, max_pixels), run, step)
+        _report(run, decisions)
+    _share_decisions(run, decisions)
     if run.fabric.world_size > 1:
         model.brdf.load_state_dict(run.fabric.broadcast(model.brdf.state_dict()))
+
+
+def _search_at(places: Places, run: Training, step: int) -> list[Decision]:
+    """`search_material` at given places."""
+    if not run.model.brdf.metals:
+        return review_metals(run.plan, run.model, places, step)
+    summary = improve_material(run.model, places)
+    if summary is not None:
+        run.reporter.say(summary)
+    return []
 
 
 def _max_light_pixels(run: Training) -> int:

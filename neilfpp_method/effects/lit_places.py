@@ -1,0 +1,111 @@
+"""Places under the light of a half-trained model, which is held fixed: the best material for each of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from neilfpp_method.effects.material_grid import (
+    METALLICS,
+    ROUGHNESSES,
+    BestMaterials,
+    best_materials,
+    mean_loss,
+    neighbors,
+    outgoing_radiance,
+    relative_error,
+)
+from neilfpp_method.effects.places import Places
+from neilfpp_method.fields.light import LightModel
+from neilfpp_method.lighting.layered_transport import layers_at, light_layers
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.structures import Material
+
+__all__ = ["METAL", "PAINT", "LitPlaces", "light_up"]
+
+PAINT, METAL = range(1), range(1, len(METALLICS))
+"""Indices in `METALLICS` of paint and of metal."""
+DRAWS = 2
+"""Random directions per texel and pixel."""
+NEIGHBORS_SHARE = 1 / 150
+"""Share of the places whose errors are added when the material of a place is chosen."""
+COLOR_SCALE = 0.2
+"""Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
+of the same look are often of one material.
+"""
+MIN_ROUGHNESS = 0.05
+"""Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
+MIN_BASE_COLOR = 0.02
+"""Base colours are raised to at least this value before their logarithms are compared."""
+
+
+@dataclass(frozen=True)
+class LitPlaces:
+    """P places whose N pixels are explained under a fixed light.
+
+    Attributes:
+        places: the places with their pixels, in linear radiance.
+        arriving: the parts of outgoing radiance of each pixel (`lighting.layered_transport`).
+        near: indices of the neighbours of each place, including itself.
+        typical: radiance of a typical pixel.
+    """
+
+    places: Places
+    arriving: Float[Tensor, "K N 3"]
+    near: Int[Tensor, "P M"]
+    typical: float
+
+    def where(self, rows: Int[Tensor, " R"]) -> LitPlaces:
+        """The same places with only some of the pixels."""
+        return LitPlaces(self.places.where(rows), self.arriving[:, rows], self.near, self.typical)
+
+    def hold_back(self, fold: int, folds: int) -> tuple[LitPlaces, LitPlaces]:
+        """Known and held-back pixels: one fold of the views, numbered from 0 to `folds` − 1, is held back."""
+        is_held_back = self.places.view % folds == fold
+        known, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
+        return self.where(known), self.where(held_back)
+
+    def best(self, metallics: range) -> BestMaterials:
+        """The material of each place that explains the pixels best, such as the best `PAINT`."""
+        return best_materials(self.arriving, self.places, self.typical, metallics, self.near)
+
+    def error(self, material: Material) -> Float[Tensor, "N 3"]:
+        """Relative error of each pixel if the places have this material, with roughness of the grid."""
+        grid = torch.tensor(ROUGHNESSES, device=self.near.device).log()
+        number = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)
+        sent = layers_at(self.arriving, number[self.places.place])
+        pixel = material[self.places.place]
+        outgoing = outgoing_radiance(sent, pixel.base_color, pixel.metallic)
+        return relative_error(outgoing, self.places, self.typical)
+
+    def mean_errors(self, material: Material) -> Float[Tensor, " P"]:
+        """Mean relative error of the pixels of each place, clipped at 1; NaN for a place without pixels."""
+        has_pixels = torch.bincount(self.places.place, minlength=self.places.count) > 0
+        error = self.places.mean(self.error(material).abs().clamp_max(1).mean(-1))
+        return torch.where(has_pixels, error, torch.nan)
+
+    def loss(self, material: Material) -> Float[Tensor, " P"]:
+        """The loss of `best_materials` for given materials."""
+        return mean_loss(self.error(material), self.places, self.near)
+
+
+@torch.no_grad()
+def light_up(model: NeilfModel, places: Places) -> LitPlaces:
+    """Trace the light of a model, which has an environment map, to the pixels of places.
+
+    Args:
+        model: gives the light, the scene, the lobe, and the base colours by which neighbours are chosen.
+        places: places with their pixels in the training views, in linear radiance. Those without pixels are
+            left out of the result.
+    """
+    numbers, place = places.place.unique(return_inverse=True)
+    places = Places(len(numbers), place, places.view, places.observed)
+    shared = places.shared_points()
+    light = LightModel(model.light, model.lamps)
+    draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]
+    look = COLOR_SCALE * model.brdf(shared.position).base_color.clamp_min(MIN_BASE_COLOR).log()
+    near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
+    return LitPlaces(places, torch.stack(draws).mean(0), near, model.facts.median_radiance)
