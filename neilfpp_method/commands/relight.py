@@ -40,8 +40,8 @@ class Relight:
     )
     """Views of the capture, as a set or by name; or a circle around the scene, which is also
     written as turntable.mp4."""
-    frames: int = 96
-    """Number of frames of a turntable."""
+    frames: int | None = None
+    """Number of frames of a turntable; default: 96."""
     edits: Annotated[
         tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="NAME=VALUE")
     ] = ()

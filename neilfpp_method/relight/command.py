@@ -49,6 +49,8 @@ __all__ = ["relight"]
 
 OWN = "own"
 """Name of the run's estimated light in paths and records."""
+FRAMES = 96
+"""Default number of frames of a turntable: four seconds of film."""
 FORMAT = 1
 """Version of the format of the records."""
 
@@ -110,7 +112,7 @@ def relight(
 def _shots(request: RelightRequest, run: Run) -> list[Shot]:
     capture = run.capture
     if request.is_turntable:
-        return turntable(capture, request.frames, request.scale, request.width)
+        return turntable(capture, request.frames or FRAMES, request.scale, request.width)
     views = capture.chosen_views(request.views)
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 

@@ -39,7 +39,7 @@ class RelightRequest:
     lamps: str
     lamp_edits: tuple[str, ...]
     views: tuple[str, ...]
-    frames: int
+    frames: int | None
     edits: tuple[str, ...]
     box: tuple[float, ...] | None
     mask: tuple[Path, ...]
@@ -129,6 +129,8 @@ def _check_combinations(request: RelightRequest) -> None:
             )
     if request.lamp_edits and request.lamps == "drop":
         raise UserError("--lamp changes lamps, but --lamps drop removes all of them", "give only one of both")
+    if request.frames is not None and not circle:
+        raise UserError("--frames without --views turntable has no effect", "add --views turntable")
     if circle and len(request.views) > 1:
         raise UserError("--views turntable is a circle, and no other views go with it", "give one of them")
     if request.truth and (circle or sized):
