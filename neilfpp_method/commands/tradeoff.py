@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from neilfpp_method.commands.command import Command, Device, terminal
+import tyro
+
+from neilfpp_method.commands.command import Command, terminal
 from neilfpp_method.commands.report import after_training
 
 __all__ = ["COMMAND"]
@@ -32,8 +34,18 @@ class Tradeoff:
     """Source of geometry, as in neilfpp train; mesh: the capture's inputs/model/mesh.ply."""
     report: bool = False
     """Write the report of each run, within its budget."""
-    device: Device = "auto"
-    """Device to compute on."""
+    relight: Path | None = None
+    """Also relight the test views of each run with this environment map, and compare with --truth."""
+    truth: Path | None = None
+    """Folder of the true images of the test views under the map of --relight: VIEW.exr or .png."""
+    env_layout: Literal["ours", "common"] = "ours"
+    """Layout of the map of --relight, as in neilfpp relight."""
+    device: Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto|cuda:N,cuda:N")] = "auto"
+    """Device to compute on, or several: then each has one run at a time, in a process of its own."""
+    slurm: Annotated[str | None, tyro.conf.arg(metavar="NAME=VALUE,NAME=VALUE")] = None
+    """Make each run a job of a Slurm cluster with these parameters of submitit and sbatch, such as
+    partition=gpu,gpus_per_node=1. Several devices and --slurm need the extra `cluster`.
+    """
 
 
 def run(options: Tradeoff) -> None:
@@ -47,10 +59,20 @@ def run(options: Tradeoff) -> None:
     config = fixed_geometry(config) if options.host == "mesh" else config
     budgets = [read_duration(word) for word in options.budgets.split(",") if word.strip()]
     out = options.out or Path("runs") / f"{options.data.resolve().name}-{config.preset}-tradeoff"
-    at_end = (lambda path: after_training(path, options.device)) if options.report else None
-    request = TradeoffRequest(options.data, out, config, budgets, options.seeds, options.device)
+    request = TradeoffRequest(
+        data=options.data,
+        out=out,
+        config=config,
+        budgets=budgets,
+        seeds=options.seeds,
+        device=options.device,
+        slurm=options.slurm,
+        relight=options.relight,
+        truth=options.truth,
+        env_layout=options.env_layout,
+    )
     with computing_fast():
-        run_tradeoff(request, terminal(), at_end)
+        run_tradeoff(request, terminal(), after_training if options.report else None)
 
 
 COMMAND = Command(
@@ -59,5 +81,8 @@ COMMAND = Command(
     [
         "neilfpp tradeoff --data captures/teapot --budgets 1m,3m,10m",
         "neilfpp tradeoff --data captures/teapot --host mesh --budgets 1m,3m --seeds 3 --out runs/frontier",
+        "neilfpp tradeoff --data captures/teapot --relight studio.exr --truth captures/teapot_studio",
+        "neilfpp tradeoff --data captures/teapot --seeds 3 --device cuda:0,cuda:1",
+        "neilfpp tradeoff --data captures/teapot --seeds 3 --slurm partition=gpu,gpus_per_node=1",
     ],
 )

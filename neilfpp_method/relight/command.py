@@ -24,6 +24,7 @@ import torch
 
 from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.errors import UserError
+from neilfpp_method.evaluate.size import at_size
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.relight.cameras import Shot, pixel_rays, turntable, view_shots
 from neilfpp_method.relight.comparison import compare, find_truth, read_truth
@@ -76,6 +77,8 @@ def relight(
     check_request(request)
     run = load_run(request.run, pick_device(request.device), request.checkpoint)
     check_material(run)
+    # True images have the size of the files; the run may be trained at a smaller one.
+    run = at_size(run, scale=1.0) if request.truth else run
     out = request.out or request.run / "relit"
     check_folder(out)
     shots = _shots(request, run)

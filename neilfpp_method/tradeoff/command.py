@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
-from pathlib import Path
+from collections.abc import Collection, Sequence
 
 from rich.console import Console
 
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.errors import UserError
+from neilfpp_method.tradeoff.ending import Ending, Report
 from neilfpp_method.tradeoff.files import write_tradeoff
 from neilfpp_method.tradeoff.frontier import FIGURES, BudgetResult, RunResult, frontier
+from neilfpp_method.tradeoff.machines import parse_devices, parse_slurm
 from neilfpp_method.tradeoff.planned_runs import (
     PlannedRun,
     TradeoffRequest,
     check_same,
-    make_run,
+    is_complete,
     measured,
     plan_runs,
 )
+from neilfpp_method.tradeoff.queue import Engine, ThisProcess, work_through
+from neilfpp_method.tradeoff.relighting import plan_relighting
+from neilfpp_method.tradeoff.submitted import LocalProcesses, SlurmCluster
+from neilfpp_method.train.device import pick_device
 from neilfpp_method.train.output import check_folder
 
 __all__ = ["run_tradeoff"]
 
 
 def run_tradeoff(
-    request: TradeoffRequest, console: Console, at_end: Callable[[Path], None] | None = None
+    request: TradeoffRequest, console: Console, report: Report | None = None
 ) -> list[BudgetResult]:
-    """Train and evaluate all runs that are not finished, one after the other, and write the frontier.
+    """Train and evaluate all runs that are not finished, and write the frontier.
 
     The files are written again after each run. A run that cannot be made or measured is reported, left out,
     and tried again by the next call: its budget may be too small for this machine, or it found no surface.
@@ -36,7 +41,7 @@ def run_tradeoff(
     Args:
         request: the runs.
         console: where progress is printed.
-        at_end: called with the folder of each run that has been trained.
+        report: writes the report of a run within its budget.
 
     Returns:
         The points of the frontier.
@@ -44,33 +49,61 @@ def run_tradeoff(
     Raises:
         UserError: if the input is unusable, if the folder contains runs of another capture or with other
             settings, or if no run could be finished.
-        Stopped: if the user stops the command; the next call continues it.
+        Stopped, KeyboardInterrupt: if the user stops the command; the next call continues it.
     """
-    out, runs = request.out, plan_runs(request)
+    out = request.out
+    plan_runs(request)
     # Errors in the capture are raised before anything is written.
-    load_capture(request.data)
+    capture = load_capture(request.data)
+    runs = plan_runs(request, plan_relighting(request.relight, request.truth, request.env_layout, capture))
     check_folder(out)
     for run in runs:
         check_same(run)
     left_out: dict[str, str] = {}
-    for number, run in enumerate(runs, start=1):
-        console.print(f"run {number} of {len(runs)}: {run.name}", soft_wrap=True)
-        try:
-            make_run(run, console, at_end)
-        except UserError as error:
-            left_out[run.name] = str(error)
-            console.print(f"left out: {error}", style="yellow", soft_wrap=True)
-            continue
-        title = f"{request.data.resolve().name}, {request.config.preset}"
+    title = f"{request.data.resolve().name}, {request.config.preset}"
+
+    def say(text: str, style: str | None = None) -> None:
+        console.print(text, style=style, soft_wrap=True)
+
+    def on_end(run: PlannedRun, ending: Ending) -> None:
+        if ending.left_out:
+            left_out[run.name] = ending.left_out
+            say(f"{run.name} left out: {ending.left_out}", "yellow")
+            return
+        say(f"{run.name} finished")
         write_tradeoff(out, title, finished_runs(runs, left_out))
+
+    missing = [run for run in runs if not is_complete(run, bool(capture.test_views))]
+    engine = _engine(request, len(missing), console, report)
+    if len(missing) < len(runs):
+        say(f"{len(runs) - len(missing)} of {len(runs)} runs are finished already")
+        write_tradeoff(out, title, finished_runs(runs, left_out))
+    work_through(missing, engine, say, on_end)
     finished = finished_runs(runs, left_out)
     if not finished:
         raise UserError(f"{out}: no run could be made", list(left_out.values())[-1])
     points = frontier(finished)
     for line in frontier_table(points):
-        console.print(line, soft_wrap=True)
-    console.print(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg", soft_wrap=True)
+        say(line)
+    say(f"written to {out / 'tradeoff.csv'}, tradeoff.json and tradeoff.svg")
     return points
+
+
+def _engine(request: TradeoffRequest, runs: int, console: Console, report: Report | None) -> Engine:
+    """What starts the runs, as the options `--device` and `--slurm` say.
+
+    Raises:
+        UserError: if an option is invalid, a device is missing, or submitit is needed and missing.
+    """
+    devices = parse_devices(request.device)
+    if request.slurm is not None:
+        if len(devices) > 1:
+            raise UserError("--slurm starts each run on one device", "leave --device out")
+        return SlurmCluster(parse_slurm(request.slurm), request.device, runs, request.out, report)
+    if len(devices) > 1:
+        return LocalProcesses(devices, request.out, report)
+    pick_device(request.device)
+    return ThisProcess(request.device, console, report)
 
 
 def finished_runs(runs: Sequence[PlannedRun], left_out: Collection[str]) -> list[RunResult]:

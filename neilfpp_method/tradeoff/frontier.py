@@ -25,10 +25,12 @@ FIGURES: Mapping[str, _Figure] = {
     "metallic_psnr": _Figure("metallic", "dB", True),
     "normal_mae_deg": _Figure("normals", "degrees", False),
     "pbr_psnr": _Figure("novel view", "dB", True),
+    "relight_psnr_scaled": _Figure("relit views, scaled", "dB", True),
     "held_back_psnr": _Figure("held-back pixels", "dB", True),
 }
-"""Metrics of `neilfpp eval`, as far as the capture has the truth for them. The last one is measured at
-held-back pixels of training views (`train.quality`) and always present.
+"""Metrics of `neilfpp eval`, as far as the capture has the truth for them, and that of `neilfpp relight
+--truth`, if true images were given. The last one is measured at held-back pixels of training views
+(`train.quality`) and always present.
 """
 
 

@@ -13,11 +13,13 @@ from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate, write_metrics
 from neilfpp_method.evaluate.size import at_size
+from neilfpp_method.relight.maps import Layout
 from neilfpp_method.report.files import flat_settings
 from neilfpp_method.report.measured import is_outdated
 from neilfpp_method.settings.plain import to_dict
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.tradeoff.frontier import FIGURES, RunResult
+from neilfpp_method.tradeoff.relighting import Relighting, has_relit, metrics_path, relight_run
 from neilfpp_method.train.budget_record import read_budget
 from neilfpp_method.train.budgeted import planned_settings
 from neilfpp_method.train.command import run_training
@@ -29,7 +31,7 @@ from neilfpp_method.train.quality import read_checks
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import CaptureSource, load_run, read_description
 
-__all__ = ["PlannedRun", "TradeoffRequest", "check_same", "make_run", "measured", "plan_runs"]
+__all__ = ["PlannedRun", "TradeoffRequest", "check_same", "is_complete", "make_run", "measured", "plan_runs"]
 
 METRICS = "metrics.json"
 """File of a run with its metrics on test views."""
@@ -45,7 +47,9 @@ class TradeoffRequest:
         config: the settings of all runs; the seeds start at that of the settings.
         budgets: the time budgets, in seconds.
         seeds: number of runs per budget.
-        device: name of the device.
+        device: value of `--device`: the device, or several separated by commas.
+        slurm: value of `--slurm`; None to train on this machine.
+        relight, truth, env_layout: values of the options of these names.
     """
 
     data: Path
@@ -54,6 +58,10 @@ class TradeoffRequest:
     budgets: Sequence[float]
     seeds: int
     device: str
+    slurm: str | None = None
+    relight: Path | None = None
+    truth: Path | None = None
+    env_layout: Layout = "ours"
 
 
 @dataclass(frozen=True)
@@ -66,7 +74,7 @@ class PlannedRun:
         config: the settings, including the seed.
         effects: value of `--effects`.
         budget: time budget, in seconds.
-        device: name of the device.
+        light: light under which it is compared with true images; None if it is not compared.
     """
 
     data: Path
@@ -74,7 +82,7 @@ class PlannedRun:
     config: NeilfConfig
     effects: str
     budget: float
-    device: str
+    light: Relighting | None = None
 
     @property
     def name(self) -> str:
@@ -82,8 +90,12 @@ class PlannedRun:
         return self.out.name
 
 
-def plan_runs(request: TradeoffRequest) -> list[PlannedRun]:
+def plan_runs(request: TradeoffRequest, light: Relighting | None = None) -> list[PlannedRun]:
     """Plan a run for each budget and seed, by budget, with the folders `OUT/10m-seed0` and so on.
+
+    Args:
+        request: the runs.
+        light: light under which all runs are compared with true images.
 
     Raises:
         UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
@@ -99,7 +111,7 @@ def plan_runs(request: TradeoffRequest) -> list[PlannedRun]:
         for seed in range(config.train.seed, config.train.seed + request.seeds):
             out = request.out / f"{format_duration(budget)}-seed{seed}"
             seeded = replace(config, train=replace(config.train, seed=seed))
-            runs.append(PlannedRun(request.data, out, seeded, effects, budget, request.device))
+            runs.append(PlannedRun(request.data, out, seeded, effects, budget, light))
     return runs
 
 
@@ -140,15 +152,22 @@ def _compared(
     return {**capture, **settings, "--effects": effects, "the budget in seconds": budget}
 
 
-def make_run(run: PlannedRun, console: Console, at_end: Callable[[Path], None] | None = None) -> None:
-    """Train and evaluate a run, or only the parts that are missing.
+def make_run(
+    run: PlannedRun, device: str, console: Console, report: Callable[[Path, str], None] | None = None
+) -> None:
+    """Train, evaluate and relight a run, or only do the parts that are missing.
+
+    Args:
+        run: the run.
+        device: name of the device.
+        console: where progress is printed.
+        report: called with the folder and the device when the run has been trained, within its budget.
 
     Raises:
         UserError: for example if the budget is too small for this machine.
     """
-    exists = (run.out / "config.json").is_file()
-    plan = read_budget(run.out) if exists else None
-    if plan is None or plan.took is None:
+    if not _is_trained(run):
+        exists = (run.out / "config.json").is_file()
         request = TrainingRequest(
             data=None if exists else run.data,
             out=run.out,
@@ -156,13 +175,24 @@ def make_run(run: PlannedRun, console: Console, at_end: Callable[[Path], None] |
             resume=exists,
             effects=None if exists else parse_effects(run.effects),
             budget=run.budget,
-            device=run.device,
+            device=device,
         )
-        run_training(request, console, at_end)
+        run_training(request, console, (lambda path: report(path, device)) if report else None)
     if not _has_metrics(run.out):
-        trained = at_size(load_run(run.out, pick_device(run.device)), None, None)
+        trained = at_size(load_run(run.out, pick_device(device)), None, None)
         if trained.capture.test_views:
             write_metrics(run.out / METRICS, trained, evaluate(trained))
+    if run.light is not None and not has_relit(run.out, run.light):
+        relight_run(run.out, run.light, device, lambda text: console.print(text, soft_wrap=True))
+
+
+def is_complete(run: PlannedRun, with_tests: bool) -> bool:
+    """Whether nothing of a run is missing; `with_tests` tells whether the capture has test views."""
+    return (
+        _is_trained(run)
+        and (_has_metrics(run.out) or not with_tests)
+        and (run.light is None or has_relit(run.out, run.light))
+    )
 
 
 def measured(run: PlannedRun) -> RunResult | None:
@@ -175,12 +205,19 @@ def measured(run: PlannedRun) -> RunResult | None:
     if plan is None or plan.took is None:
         return None
     known = read_json(run.out / METRICS) if _has_metrics(run.out) else {}
+    if run.light is not None and has_relit(run.out, run.light):
+        known = {**known, **read_json(metrics_path(run.out, run.light))}
     figures = {name: float(known[name]) for name in FIGURES if isinstance(known.get(name), int | float)}
     checks = read_checks(run.out)
     if checks:
         last = checks[-1]
         figures["held_back_psnr"] = last.radiance if last.physical is None else last.physical
     return RunResult(run.budget, run.config.train.seed, plan.took, figures)
+
+
+def _is_trained(run: PlannedRun) -> bool:
+    plan = read_budget(run.out)
+    return plan is not None and plan.took is not None
 
 
 def _has_metrics(folder: Path) -> bool:

@@ -17,9 +17,17 @@ from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train.budget_record import BudgetPlan, Revision, write_budget
 from neilfpp_method.train.pace import with_steps
 from neilfpp_method.train.quality import QualityCheck
-from neilfpp_method.train.trial import Trial, TrialLimits, Workload, run_trial
+from neilfpp_method.train.trial import Trial, TrialLimits, TrialTooLong, Workload, run_trial
 
-__all__ = ["close_budget", "outcome", "plan_budget", "plan_summary", "planned_effects", "planned_settings"]
+__all__ = [
+    "BudgetTooSmall",
+    "close_budget",
+    "outcome",
+    "plan_budget",
+    "plan_summary",
+    "planned_effects",
+    "planned_settings",
+]
 
 TRIAL_SHARE = 0.03
 """Share of the budget that the steps of a trial may take."""
@@ -31,8 +39,24 @@ effects that they would decide stay as in the settings.
 """
 LIGHT_SHARE = 0.2
 """Share of the budget that the search for the initial light may take; it uses as many places as fit."""
+GUESSED_BUDGET = 5
+"""The budget that is proposed if one passed before any trial was finished, as a multiple of it."""
 LONG_TAILS = "long-tails"
 """The effect that is decided together with the initial light."""
+
+
+class BudgetTooSmall(UserError):
+    """A budget is too small for this machine.
+
+    Args:
+        problem, remedy: as for `UserError`.
+        needed: seconds that the smallest useful training takes after the trial; larger budgets below it are
+            too small, too, because the work that is fitted into a budget grows with it.
+    """
+
+    def __init__(self, problem: str, remedy: str, needed: float) -> None:
+        super().__init__(problem, remedy)
+        self.needed = needed
 
 
 def plan_budget(budget: float, work: Workload, ledger: Ledger) -> BudgetPlan:
@@ -45,10 +69,14 @@ def plan_budget(budget: float, work: Workload, ledger: Ledger) -> BudgetPlan:
         ledger: the clock; time that has already passed is part of the budget.
 
     Raises:
-        UserError: if the budget is too small; the message names the smallest usable budget.
+        BudgetTooSmall: the message names the smallest usable budget. If the trial takes longer than the
+            budget, it ends at once.
     """
     limits = TrialLimits(
-        steps=min(TRIAL_SHARE * budget, MAX_TRIAL), places=PLACES_SHARE * budget, light=LIGHT_SHARE * budget
+        steps=min(TRIAL_SHARE * budget, MAX_TRIAL),
+        places=PLACES_SHARE * budget,
+        light=LIGHT_SHARE * budget,
+        has_time=lambda: ledger.total < budget,
     )
     trials: dict[Size, Trial] = {}
 
@@ -58,22 +86,37 @@ def plan_budget(budget: float, work: Workload, ledger: Ledger) -> BudgetPlan:
         return share_for(trials[size].costs, budget, ledger.total)
 
     size: Size = "usual"
-    candidate = next_size(share("usual"))
-    if candidate == "small" or (candidate == "large" and share("large") >= 1.0):
-        size = candidate
-    affordable, trial = share(size), trials[size]
+    try:
+        candidate = next_size(share("usual"))
+        if candidate == "small" or (candidate == "large" and share("large") >= 1.0):
+            size = candidate
+        affordable, trial = share(size), trials[size]
+    except TrialTooLong:
+        raise _too_small(budget, trials.get("usual"), ledger.total) from None
     if affordable < MIN_SHARE:
-        needed = smallest_budget(trial.costs, ledger.total)
-        raise UserError(
-            f"a budget of {format_duration(budget)} is too small: {format_duration(ledger.total)} of it have "
-            f"passed, and {format_duration(trial.costs.once)} are needed for work that does not depend on "
-            "the number of steps",
-            "the smallest usable budget on this machine at its present load is --budget "
-            f"{format_duration(needed)}",
-        )
+        raise _too_small(budget, trial, ledger.total)
     plan = BudgetPlan(budget, size, trial.costs, trial.places > 0.0, trial.light_pixels)
     plan.revisions.append(Revision(ledger.total, 0, steps_for(trial.costs, affordable)))
     return plan
+
+
+def _too_small(budget: float, trial: Trial | None, spent: float) -> BudgetTooSmall:
+    """The error for a budget, from a finished trial, or from none if the budget passed during the first."""
+    problem = f"a budget of {format_duration(budget)} is too small: "
+    if trial is None:
+        guess = format_duration(GUESSED_BUDGET * budget)
+        return BudgetTooSmall(
+            problem + "it has passed while the time of a few steps was measured",
+            f"give several times as much, such as --budget {guess}, or end other programs",
+            budget,
+        )
+    return BudgetTooSmall(
+        f"{problem}{format_duration(spent)} of it have passed, and {format_duration(trial.costs.once)} are "
+        "needed for work that does not depend on the number of steps",
+        "the smallest usable budget on this machine at its present load is --budget "
+        f"{format_duration(smallest_budget(trial.costs, spent))}",
+        trial.costs.once + MIN_SHARE * trial.costs.all_steps,
+    )
 
 
 def planned_settings(plan: BudgetPlan, config: NeilfConfig) -> NeilfConfig:

@@ -129,6 +129,8 @@ def plan_run(
         if request.processes > 1:
             raise UserError("--budget plans for one process", "leave --devices and --nodes out")
         work = Workload(capture, settings, wanted, device, report)
+        duration = format_duration(request.budget)
+        console.print(f"budget {duration}: measuring a few steps of each stage", soft_wrap=True)
         budget = plan_budget(request.budget, work, ledger)
         console.print(plan_summary(budget))
         settings = planned_settings(budget, settings)

@@ -43,7 +43,7 @@ from neilfpp_method.train.device import waiting
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
 from neilfpp_method.train.preview import preview_pixels
 
-__all__ = ["Trial", "TrialLimits", "Workload", "run_trial"]
+__all__ = ["Trial", "TrialLimits", "TrialTooLong", "Workload", "run_trial"]
 
 VIEWS = 4
 """Number of training views that a trial reads."""
@@ -104,11 +104,22 @@ class TrialLimits:
             left out.
         light: maximum time of the search for the initial light in the training. It determines the number of
             pixels of the search.
+        has_time: whether the trial may go on; called before each part of the work.
     """
 
     steps: float
     places: float
     light: float
+    has_time: Callable[[], bool] = lambda: True
+
+    def check_time(self) -> None:
+        """Raise `TrialTooLong` if the trial may not go on."""
+        if not self.has_time():
+            raise TrialTooLong
+
+
+class TrialTooLong(Exception):
+    """The trial takes longer than it may."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +204,11 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
         work: the training. Large views are read at a smaller size, which does not affect the time of a step.
             The steps of the stages are used as proportions.
         limits: how long the trial, and parts of the training, may take.
+
+    Raises:
+        TrialTooLong: see `TrialLimits.has_time`.
     """
+    limits.check_time()
     setup = _set_up(work)
     lengths = {stage: steps for stage, steps in stage_steps(setup.config.train).items() if steps}
     with_material = [stage for stage in lengths if setup.model.stages[stage].trains_material]
@@ -204,7 +219,7 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     surface = setup.seconds(lambda: _review_surface(setup.plan, setup.model, setup.pixels))
     costs, times = {}, _StageTimes()
     for stage, steps in lengths.items():
-        times = _measure_stage(setup, stage, limits.steps / len(lengths))
+        times = _measure_stage(setup, stage, limits.steps / len(lengths), limits.check_time)
         searches = len(SEARCH_AT) * SEARCH_SHARE * search.seconds if stage is Stage.MATERIAL_INIT else 0.0
         cost = _cost_of_steps(setup, steps, times, searches)
         if stage in with_material:
@@ -296,10 +311,11 @@ def _steps_per_fit(config: NeilfConfig) -> int:
     return 1 if config.light.kind == "free" else config.light.fit.every
 
 
-def _measure_stage(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
+def _measure_stage(setup: _Setup, stage: Stage, limit: float, check_time: Callable[[], None]) -> _StageTimes:
     """Time the steps of a stage for about `limit` seconds, and its picture and health check."""
     model, with_material = setup.model, setup.model.stages[stage].trains_material
-    times = _train_steps(setup, stage, limit)
+    times = _train_steps(setup, stage, limit, check_time)
+    check_time()
     model.eval()
     times.picture = _picture_seconds(setup, with_material)
     sample = setup.pixels.sample(CHECKED_PIXELS, gradients=False)
@@ -308,7 +324,7 @@ def _measure_stage(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
     return times
 
 
-def _train_steps(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
+def _train_steps(setup: _Setup, stage: Stage, limit: float, check_time: Callable[[], None]) -> _StageTimes:
     """Time steps of a stage as `train.loop` takes them.
 
     It ends when the time limit has passed and, if the stage fits the light, two fits have been made, or after
@@ -320,6 +336,7 @@ def _train_steps(setup: _Setup, stage: Stage, limit: float) -> _StageTimes:
     fits = model.stages[stage].trains_material and not isinstance(solver, NothingToSolve)
     gradients = "smoothness" in active_losses(stage, config, model.stages)
     for number in range(WARM_STEPS + MAX_STEPS):
+        check_time()
         step_began = time.perf_counter()
         seed_step(config.train.seed, number)
         set_rates(optimizer, config.optimizer, StagePosition(stage, number, WARM_STEPS + MAX_STEPS))

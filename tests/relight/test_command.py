@@ -272,6 +272,19 @@ def test_figures_against_true_images(given, sky, tmp_path, capfd):
     assert figures["views"]["000"] > 90
 
 
+def test_true_images_have_the_size_of_the_files(masked_capture, given, sky, tmp_path):
+    """The images of a run that was trained at half the size are compared at full size."""
+    half = train_tiny(
+        masked_capture, tmp_path / "half", "--host", "mesh", "--scale", "0.5", config=few_steps
+    )
+    assert relit(given, "--env", sky, "--out", tmp_path / "full") == 0
+    truth = tmp_path / "full" / "studio"
+    assert relit(half, "--env", sky, "--truth", truth) == 0
+    figures = json.loads((half / "relit" / "studio" / "metrics.json").read_text())
+    assert figures["relight_psnr_scaled"] > 20
+    assert read_image(half / "relit" / "studio" / "000.exr").pixels.shape == (18, 24, 3)
+
+
 def test_the_map_behind_the_surface(given, sky, tmp_path):
     assert relit(given, "--env", sky, "--background", "map", "--out", tmp_path) == 0
     image = read_image(tmp_path / "studio" / "000.exr")

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from neilfpp_method.cli import main
+from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings import presets
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.tradeoff import planned_runs
+from neilfpp_method.tradeoff import planned_runs, relighting
 from neilfpp_method.tradeoff.planned_runs import TradeoffRequest, plan_runs
 from neilfpp_method.train.budget_record import read_budget
 from tests.data.make_capture import make_capture
@@ -108,6 +110,69 @@ def test_no_budget_is_large_enough(tmp_path, words, clock, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_budget_that_an_earlier_run_has_shown_to_be_too_small_is_not_tried(words, clock, capsys):
+    """The trial of 1s shows that 14.5 s are needed; its second seed and 10s are refused without a trial."""
+    assert main([*words, "--budgets", "1s,10s,2m", "--seeds", "2"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("measuring a few steps of each stage") == 3  # 1s-seed0 and both runs of 2m
+    for name in ("1s-seed1", "10s-seed0", "10s-seed1"):
+        assert f"{name} left out: a budget of {name.split('-')[0]} is too small, as an earlier run" in said
+        assert f": {name}\n" not in said
+
+
+def test_relit_views_are_compared_without_another_training(tmp_path, words, clock, monkeypatch, capsys):
+    monkeypatch.setattr(relighting, "RESOLUTION", 32)
+    out, words = tmp_path / "out", [*words, "--budgets", "2m,3m"]
+    assert main(words) == 0
+    checkpoints = {name: files(out / name / "checkpoints") for name in ("2m-seed0", "3m-seed0")}
+    assert "relight_psnr_scaled" not in (out / "tradeoff.csv").read_text()
+
+    sky = tmp_path / "studio.exr"
+    write_exr(sky, {"RGB": np.full((8, 16, 3), 0.5, np.float32)})
+    truth = tmp_path / "truth"
+    write_exr(truth / "000.exr", {"RGB": np.full((36, 48, 3), 0.25, np.float32)})
+    relit = [*words, "--relight", str(sky), "--truth", str(truth)]
+    assert main(relit) == 0
+    assert {name: files(out / name / "checkpoints") for name in checkpoints} == checkpoints
+    points = json.loads((out / "tradeoff.json").read_text())["points"]
+    for name, point in zip(checkpoints, points, strict=True):
+        (measured,) = (out / name / "relit").glob("tradeoff-*/studio/metrics.json")
+        figures = json.loads(measured.read_text())
+        assert point["figures"]["relight_psnr_scaled"] == figures["relight_psnr_scaled"] > 0
+    assert "relight_psnr_scaled" in (out / "tradeoff.csv").read_text().splitlines()[0].split(",")
+    assert "relit views, scaled" in (out / "tradeoff.svg").read_text()
+
+    before = files(out / "2m-seed0")
+    capsys.readouterr()
+    assert main(relit) == 0
+    assert files(out / "2m-seed0") == before
+    assert "2 of 2 runs are finished already" in capsys.readouterr().out
+
+    # Other true images of the same names are compared, too.
+    write_exr(truth / "000.exr", {"RGB": np.random.default_rng(0).random((36, 48, 3), np.float32)})
+    assert main(relit) == 0
+    after = json.loads((out / "tradeoff.json").read_text())["points"]
+    assert after[0]["figures"]["relight_psnr_scaled"] < points[0]["figures"]["relight_psnr_scaled"] - 1
+
+
+def test_relighting_needs_a_map_and_true_images(tmp_path, words, capsys):
+    sky, small = tmp_path / "studio.exr", tmp_path / "small"
+    write_exr(sky, {"RGB": np.ones((8, 16, 3), np.float32)})
+    write_exr(small / "000.exr", {"RGB": np.ones((3, 4, 3), np.float32)})
+    for options, complaint in (
+        (["--relight", sky], "--relight and --truth belong together"),
+        (["--truth", small], "--relight and --truth belong together"),
+        (["--relight", sky, "--truth", small], "4×3 pixels, but the view has 48×36"),
+        (["--relight", sky, "--truth", tmp_path], "no true image of the view 000"),
+        (["--relight", small / "000.exr", "--truth", small], "environment map"),
+    ):
+        assert main([*words, "--budgets", "2m", *map(str, options)]) == 2
+        error = capsys.readouterr().err
+        assert complaint in error
+        assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
@@ -116,9 +181,22 @@ def test_no_budget_is_large_enough(tmp_path, words, clock, capsys):
         (["--budgets", "60s,60.2s"], "contains a budget twice"),  # both would be 1m-seed0
         (["--budgets", ","], "--budgets is empty"),
         (["--seeds", "0"], "--seeds is 0"),
+        (["--device", "abacus"], "no device 'abacus'"),
+        (["--device", "cpu,abacus"], "'abacus' is no single device"),
+        (["--device", "cpu,"], "'' is no single device"),
+        (["--device", "cpu,cuda:0"], "cannot be compared by time"),
+        (["--device", "cuda:0,cuda:0"], "a GPU occurs twice"),
+        (["--device", "cuda:998,cuda:999"], "no device 'cuda:998' here"),
+        (["--slurm", "partition"], "'partition' is no NAME=VALUE"),
+        (["--slurm", ""], "'' is no NAME=VALUE"),
+        (["--slurm", "qos=a,qos=b"], "qos occurs twice"),
+        (["--slurm", "nodes=2"], "a run is one process, not nodes=2"),
+        (["--slurm", "partition=gpu"], "no command srun here"),
+        (["--slurm", "partition=gpu", "--device", "cpu,cpu"], "--slurm starts each run on one device"),
     ],
 )
-def test_bad_input_is_one_line(tmp_path, words, options, complaint, capsys):
+def test_bad_input_is_one_line(tmp_path, words, options, complaint, capsys, monkeypatch):
+    monkeypatch.setenv("PATH", "")  # without the commands of a cluster
     assert main([*words, *options]) == 2
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -24,12 +24,12 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train import budgeted, command
 from neilfpp_method.train.budget_record import BudgetPlan, read_budget
-from neilfpp_method.train.budgeted import planned_effects
+from neilfpp_method.train.budgeted import BudgetTooSmall, plan_budget, planned_effects
 from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from neilfpp_method.train.command import run_training
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import load_run
-from neilfpp_method.train.trial import Trial, TrialLimits, Workload, run_trial
+from neilfpp_method.train.trial import Trial, TrialLimits, TrialTooLong, Workload, run_trial
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import small_config, small_training, solved_light
 from tests.train.test_resume import interrupt_at
@@ -84,6 +84,7 @@ def test_a_run_keeps_its_budget_although_steps_are_slower_than_in_the_trial(tmp_
     assert loaded.config.train.sdf_steps == last.steps["sdf_init"]
     assert loaded.config.train.joint_steps == last.steps["joint"]
     assert loaded.has_material
+    assert "budget 2m: measuring a few steps of each stage" in said
     assert "budget 2m: planned steps: sdf init" in said
     assert f"budget: {plan.took:.1f} s of 120 s" in said
 
@@ -121,6 +122,35 @@ def test_a_budget_too_small_is_refused_with_the_smallest_one(tmp_path, capture, 
     assert main([*words, "--out", str(tmp_path / "run"), "--budget", smallest]) == 0
     assert main([*words, "--out", str(tmp_path / "other"), "--budget", "ten"]) == 2
     assert not (tmp_path / "other").exists()
+
+
+def test_a_budget_that_passes_during_the_first_trial_is_refused_at_once(capture):
+    """The clock passes the budget in the first stage; neither later stages nor another size are measured."""
+    ticks = itertools.count()
+    work = workload(load_capture(capture), solved_light(small_config()), "as-set")
+    with pytest.raises(BudgetTooSmall, match=r"5s is too small: it has passed .* --budget 25s") as refused:
+        plan_budget(5.0, work, Ledger(now=lambda: 1.0 * next(ticks)))
+    assert next(ticks) < 10  # looks at the clock; a stage takes at least six steps
+    assert refused.value.needed == 5.0
+
+
+def test_a_budget_that_passes_during_the_second_trial_names_the_smallest_of_the_first(
+    capture, clock, monkeypatch
+):
+    trials = []
+
+    def run_once(work: Workload, limits: TrialLimits) -> Trial:
+        trials.append(work)
+        if len(trials) == 2:
+            raise TrialTooLong
+        return Trial(Costs({"joint": StageCost(100, 1.0, end=2.0)}), places=0.0, light_pixels=0)
+
+    monkeypatch.setattr(budgeted, "run_trial", run_once)
+    work = workload(load_capture(capture), small_config(), "as-set")
+    with pytest.raises(BudgetTooSmall, match=r"the smallest usable budget .* --budget 15s") as refused:
+        plan_budget(11.0, work, Ledger(now=lambda: 0.0))
+    assert refused.value.needed == pytest.approx(2.0 + 0.1 * 100)
+    assert len(trials) == 2
 
 
 def test_a_budget_with_several_processes_is_refused(tmp_path, capture, clock):
