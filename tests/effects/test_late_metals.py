@@ -24,7 +24,7 @@ LOBE = LOBES["spherical_gaussian"]
 
 
 def two_halves(metallic: float) -> Places:
-    """A ball of dull grey paint, and of another material with this metallic at the first quarter of places."""
+    """A ball of dull grey paint, and of another material with this metallic at a quarter of the places."""
     other = (torch.arange(COUNT) < COUNT // 4).float()[:, None]
     base_color = (0.3 + 0.4 * other).expand(-1, 3)
     return ball(base_color, 0.7 - 0.4 * other, metallic * other, LOBE, VIEWS, sky())
