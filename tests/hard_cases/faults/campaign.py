@@ -247,7 +247,8 @@ def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     for name, *options in COMMANDS if each else ():
         words = [str(folder / SKY) if option == SKY else option for option in options]
         attack_command(report, folder, [name, str(whole), *words], draw, each)
-    attack_prepare(report, folder, draw, each)
+    if each:
+        attack_prepare(report, folder, draw, each)
     told = {"kills": dict(report.kills), "files": report.files, "faults": report.faults}
     report_file.write_text(json.dumps(told, indent=1))
 
