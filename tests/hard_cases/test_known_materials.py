@@ -258,7 +258,11 @@ LONG = {
         {"base_color": 0.009, "roughness": 0.013, "metallic": 0.019, "image": 0.027, "radiance": 0.14},
         {"mesh": True},
     ),
-    "mesh, LDR": Case(PAINT, {"base_color": 0.025}, {"mesh": True, "response": "srgb"}),
+    "mesh, LDR": Case(
+        PAINT,
+        {"base_color": 0.011, "roughness": 0.014, "metallic": 0.028, "image": 0.04, "radiance": 0.14},
+        {"mesh": True, "response": "srgb"},
+    ),
     "light not known": Case(
         PAINT, {"scaled_base_color": 0.19, "roughness": 0.25, "image": 0.11}, {"known_light": False}
     ),
