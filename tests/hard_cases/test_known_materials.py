@@ -1,7 +1,7 @@
 """Hard materials and lights with a known truth: what training recovers is right, not only finite.
 
 The images are those of `known_ball`, made by quadrature apart from the package. An attached host knows the
-geometry; material, and in some cases light, is learned. Each bound is about twice the error measured.
+geometry, or the host is the ball as a mesh; material, and in some cases light, is learned. Each bound is about twice the error measured.
 What the images cannot tell has no bound: the roughness of a white surface under even light, the metallic of a
 black one.
 """
