@@ -2,8 +2,8 @@
 
 The images are those of `known_ball`, made by quadrature apart from the package. An attached host knows the
 geometry, or the host is the ball as a mesh; material, and in some cases light, is learned. Each bound is 1.5
-to 2 times the error measured. What the images cannot tell has no bound: the roughness of a white surface under
-even light, the metallic of a black one.
+to 2 times the error measured. What the images cannot tell has no bound: the roughness of a white surface
+under even light, the metallic of a black one.
 """
 
 from __future__ import annotations
