@@ -14,6 +14,7 @@ import numpy as np
 
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.capture_folder import FILE, recognize, write_capture
+from neilfpp_method.data.formats.copies import copy_file
 from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
 from neilfpp_method.data.point_cloud import WorldPoints, read_oriented_ply, write_oriented_ply
@@ -174,9 +175,7 @@ def _publish(
     for name in IMAGE_FOLDERS:
         shutil.rmtree(out / name, ignore_errors=True)
     for path in (path for view in prepared.views for path in (view.image, view.mask, view.valid) if path):
-        copy = out / path.relative_to(prepared.root)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, copy)
+        copy_file(path, out / path.relative_to(prepared.root))
     count = len(cloud.points.position)
     points = write_oriented_ply(out / CLOUD, cloud.points) if count else None
     views = tuple(_relocate(view, prepared.root, out) for view in prepared.views)

@@ -90,16 +90,14 @@ def extract_features(
         KeyboardInterrupt: Ctrl-C was pressed.
     """
     groups = _groups(copies, photos, cameras)
-    with closing(pycolmap.Database.open(database)) as opened:
-        known = sorted(opened.read_all_cameras(), key=lambda camera: camera.camera_id)
-        ids = [camera.camera_id for camera in known]
-        for members in list(groups.values())[len(ids) :]:
-            ids.append(opened.write_camera(_initial_camera(copies, members[0], model)))
+    with closing(pycolmap.Database.open(database)) as opened, pycolmap.DatabaseTransaction(opened):
+        for number, members in enumerate(groups.values(), start=1):
+            _register(opened, number, _initial_camera(copies, members[0], model), members)
 
     def extract(token: pycolmap.CancellationToken) -> None:
-        for camera_id, members in zip(ids, groups.values(), strict=True):
+        for number, members in enumerate(groups.values(), start=1):
             options = pycolmap.ImageReaderOptions()
-            options.existing_camera_id = camera_id
+            options.existing_camera_id = number
             names = [f"{photo.name}.png" for photo in members]
             if not token.is_cancelled:
                 pycolmap.extract_features(
@@ -155,6 +153,38 @@ def match_features(
 
     with closing(pycolmap.Database.open(database)) as watched:
         in_background(match, lambda: progress(min(watched.num_matched_image_pairs(), expected), expected))
+
+
+def _register(
+    database: pycolmap.Database, number: int, camera: pycolmap.Camera, photos: Sequence[Photo]
+) -> None:
+    """Enter a camera and its images into the database, unless they are known.
+
+    Images that COLMAP itself enters are numbered in the order in which its threads find their features, and
+    the poses depend on the numbers: a repeated command would give other poses.
+
+    Args:
+        database: COLMAP's database.
+        number: the number of the camera, from 1.
+        camera: the camera.
+        photos: its photographs.
+    """
+    if not database.exists_camera(number):
+        camera.camera_id = number
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig()
+        rig.rig_id = number
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    for photo in photos:
+        image = pycolmap.Image(name=f"{photo.name}.png", camera_id=number)
+        if database.exists_image(image.name):
+            continue
+        image.image_id = database.write_image(image)
+        frame = pycolmap.Frame()
+        frame.rig_id = number
+        frame.add_data_id(image.data_id)
+        database.write_frame(frame)
 
 
 def feature_counts(database: Path) -> dict[str, int]:

@@ -61,6 +61,8 @@ def begin(folder: Path, after: Step | None = None, **inputs: Any) -> Step:
     marker = _marker(folder)
     if marker.get("inputs") != digest:
         if folder.exists():
+            # The marker goes first: a folder that is half emptied must not count as the other inputs' result.
+            (folder / MARKER).unlink(missing_ok=True)
             shutil.rmtree(folder)
         _mark(folder, digest, None)
         return Step(folder, digest, None)

@@ -102,6 +102,7 @@ def test_broken_files(tmp_path: Path, break_file, complaint: str) -> None:
 def test_numbers_that_are_not_finite(tmp_path: Path, bad: float) -> None:
     write_ply(tmp_path / "a.ply", np.where(POSITION == 5, bad, POSITION), NORMAL)
     write_ply(tmp_path / "b.ply", POSITION, NORMAL * [[1], [0]])
-    for name in ("a", "b"):
+    write_ply(tmp_path / "c.ply", POSITION, np.vstack((NORMAL[:1], np.full((1, 3), bad))))
+    for name in ("a", "b", "c"):
         with pytest.raises(UserError, match=rf"{name}\.ply: 1 of 2 points"):
             read_oriented_ply(tmp_path / f"{name}.ply")

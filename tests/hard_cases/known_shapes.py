@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 Array = np.ndarray
 Distance = Callable[[Array], Array]
 
-CAMERAS = 3.0
-"""Distance of the cameras from the origin, scene units; the shapes lie in the unit ball."""
+CAMERAS, INSIDE = 3.0, 0.2
+"""Distance of the cameras from the origin, outside of a shape and inside of one, scene units; the shapes lie
+in the unit ball.
+"""
+PIXEL_PARTS = 4
+"""Parts of a pixel along each axis that its mean is taken over."""
 STEPS, CLOSE = 128, 1e-5
 """Steps of the sphere tracing, and the distance at which a ray has met the surface."""
 LIGHT = np.array([0.48, 0.6, 0.64])
@@ -57,6 +61,22 @@ def small(x: Array) -> Array:
     return ball(x, 0.23)
 
 
+def block(x: Array) -> Array:
+    """A cube, 1.1 wide."""
+    return box(x, (0.55, 0.55, 0.55))
+
+
+def room(x: Array) -> Array:
+    """Everything outside of a box-shaped room, 1.2 wide and 1 high."""
+    return -box(x, (0.6, 0.6, 0.5))
+
+
+def antenna(x: Array) -> Array:
+    """A ball with a wire as thin as a pixel of 64 across the frame: 0.4 long and 1/32 thick."""
+    along = np.concatenate((np.zeros_like(x[..., :2]), np.clip(x[..., 2:], 0.4, 0.8)), -1)
+    return np.minimum(ball(x, 0.4), np.linalg.norm(x - along, axis=-1) - 1 / 64)
+
+
 SHAPES: Mapping[str, Distance] = {
     "thin plate": plate,
     "wire": wire,
@@ -64,6 +84,9 @@ SHAPES: Mapping[str, Distance] = {
     "two touching balls": two_balls,
     "concave bowl": bowl,
     "a twentieth of the frame": small,
+    "cube": block,
+    "room": room,
+    "ball with an antenna": antenna,
 }
 
 
@@ -79,10 +102,24 @@ class Seen:
     color: Array
 
 
-def photograph(shape: Distance, count: int, views: int = 24, seed: int = 0) -> Seen:
-    """Random pixels of so many cameras around a shape, each with an image 2 scene units wide at the origin.
+def photograph(
+    shape: Distance,
+    count: int,
+    views: int = 24,
+    seed: int = 0,
+    frame: float = 2.0,
+    pixel: float = 0.0,
+    inside: bool = False,
+) -> Seen:
+    """Random pixels of so many cameras around a shape.
 
     The radiance of the surface depends on position and normal only; pixels beside it are black.
+
+    Args:
+        frame: width of an image at the origin, scene units.
+        pixel: width of a pixel there. Radiance and coverage are means over a pixel, and `hit` is a coverage
+            of at least ½; position and normal are those of its centre.
+        inside: the cameras stand near the origin and look away from it, with a field of view of 90°.
     """
     rng = np.random.default_rng(seed)
     turn = np.arange(views) * np.pi * (3 - np.sqrt(5))
@@ -90,13 +127,30 @@ def photograph(shape: Distance, count: int, views: int = 24, seed: int = 0) -> S
     around = np.stack((np.cos(turn), np.sin(turn), height / np.sqrt(1 - height**2)), -1)
     around /= np.linalg.norm(around, axis=-1, keepdims=True)
     view = rng.integers(views, size=count)
-    origins = CAMERAS * around[view]
     right = np.cross(around, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    across, up = rng.uniform(-1, 1, (2, count, 1))
-    directions = across * right[view] + up * np.cross(right, around)[view] - origins
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    distance = np.full(count, CAMERAS - 1.5)
+    right, down = right[view], np.cross(right, around)[view]
+    origins = (INSIDE if inside else CAMERAS) * around[view]
+    middle = (1.0 + INSIDE) * around[view] if inside else np.zeros((count, 3))
+    across, up = rng.uniform(-frame / 2, frame / 2, (2, count, 1))
+
+    def through(offset: Array) -> Seen:
+        target = middle + (across + offset[0]) * right + (up + offset[1]) * down
+        return meet(shape, origins, target - origins)
+
+    seen = through(np.zeros(2))
+    if not pixel:
+        return seen
+    parts = pixel * ((np.arange(PIXEL_PARTS) + 0.5) / PIXEL_PARTS - 0.5)
+    beside = [through(np.array([x, y])) for x in parts for y in parts]
+    covered = np.mean([part.hit for part in beside], 0) >= 0.5
+    return replace(seen, hit=covered, color=np.mean([part.color for part in beside], 0))
+
+
+def meet(shape: Distance, origins: Array, directions: Array) -> Seen:
+    """What rays of any length see: the hits by sphere tracing, and their radiance."""
+    directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    distance = np.maximum(np.linalg.norm(origins, axis=-1) - 1.5, 0.0)
     for _ in range(STEPS):
         distance = distance + np.minimum(shape(origins + distance[:, None] * directions), 0.5)
     position = origins + distance[:, None] * directions

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,9 +20,12 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import changed
+from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import HashGridConfig, NeilfConfig
 from neilfpp_method.structures import OrientedPoints, PixelBatch
 from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step, set_rates
+from tests.data.make_capture import srgb
 from tests.hard_cases.known_shapes import SHAPES, Distance, Seen, photograph
 from tests.scenes import tiny_config
 
@@ -39,6 +43,27 @@ def settings() -> NeilfConfig:
         encoding=HashGridConfig(levels=4, log2_entries=13, sdf_log2_entries=13, max_resolution=64),
         radiance=dataclasses.replace(config.radiance, width=32),
         volume=dataclasses.replace(config.volume, beta_init=0.05, samples=24),
+    )
+
+
+def settings_of_paper_ngp() -> NeilfConfig:
+    """The preset `paper-ngp`, with the same fields, losses and rates, reduced to a similar time per step."""
+    return changed(
+        preset("paper-ngp"),
+        {
+            "host.sdf.width": 32,
+            "host.sdf.feature_width": 16,
+            "encoding.levels": 6,
+            "encoding.log2_entries": 13,
+            "encoding.sdf_log2_entries": 13,
+            "encoding.max_resolution": 128,
+            "radiance.layers": 2,
+            "radiance.width": 32,
+            "brdf.width": 16,
+            "light.layers": 4,
+            "light.width": 16,
+            "volume.samples": 36,
+        },
     )
 
 
@@ -70,28 +95,43 @@ class Errors:
 
 
 def learn(
-    shape: Distance, steps: int, views: int = 24, pose_noise: float = 0.0, flipped: float | None = None
+    shape: Distance,
+    steps: int,
+    config: NeilfConfig | None = None,
+    views: int = 24,
+    pose_noise: float = 0.0,
+    flipped: float | None = None,
+    response: str = "linear",
+    autocast: bool = False,
+    **camera: Any,
 ) -> Errors:
     """Learn a shape from the pixels of so many views.
 
     Args:
+        config: settings; if None, `settings`.
         pose_noise: standard deviation of the direction of a training ray, radians.
         flipped: share of the normals that point inwards in a cloud of 500 points; if None, there is no cloud.
+        response: "linear", or "srgb" for pixels of 8 bits.
+        camera: options of `photograph`. The errors are measured with rays, not with means over pixels.
     """
-    seen, truth = photograph(shape, PIXELS, views, seed=0), photograph(shape, HELD_BACK, views=40, seed=1)
+    seen = photograph(shape, PIXELS, views, seed=0, **camera)
+    truth = photograph(shape, HELD_BACK, views=40, seed=1, **{**camera, "pixel": 0.0})
     rng = np.random.default_rng(2)
     noisy = seen.directions + pose_noise * rng.normal(size=(PIXELS, 3))
     seen = dataclasses.replace(seen, directions=noisy / np.linalg.norm(noisy, axis=-1, keepdims=True))
-    config, median = settings(), float(np.median(seen.color[seen.hit].mean(-1)))
+    config, median = config or settings(), float(np.median(seen.color[seen.hit].mean(-1)))
+    if response == "srgb":
+        seen = dataclasses.replace(seen, color=np.rint(255 * srgb(seen.color)) / 255)
+    background = "none" if config.background.kind == "none" else "constant"
     torch.manual_seed(0)
     model = NeilfModel(
         VolSdfHost(
             config,
-            SceneFacts("linear", 0.2, 1.5, "constant"),
+            SceneFacts(response, 0.2, 1.5, background),
             points=None if flipped is None else cloud(seen, flipped),
         ),
         config,
-        SceneFacts("linear", median, 1.5, "constant"),
+        SceneFacts(response, median, 1.5, background),
     )
     optimizer = make_optimizer(model, config.optimizer)
     model.freeze_for(Stage.SDF_INIT)
@@ -101,9 +141,11 @@ def learn(
         at = StagePosition(Stage.SDF_INIT, step, steps)
         set_rates(optimizer, config.optimizer, at)
         # Like the package, draw most pixels on the object.
-        rows = np.concatenate((rng.choice(on, 2 * RAYS // 3), rng.choice(off, RAYS // 3)))
-        terms = model.step(batch_of(seen, rows), Stage.SDF_INIT).terms
-        total = weigh(terms, active_losses(Stage.SDF_INIT, config, model.stages, at.share))
+        beside = RAYS // 3 if len(off) else 0
+        rows = np.concatenate((rng.choice(on, RAYS - beside), rng.choice(off, beside) if beside else []))
+        with torch.autocast("cpu", dtype=torch.bfloat16) if autocast else nullcontext():
+            terms = model.step(batch_of(seen, rows.astype(int)), Stage.SDF_INIT).terms
+            total = weigh(terms, active_losses(Stage.SDF_INIT, config, model.stages, at.share))
         optimizer.zero_grad()
         total.loss.backward()
         assert all(norm.isfinite() for norm in gradient_norms(model).values())
@@ -158,14 +200,43 @@ CASES = {
     "every fifth normal flipped": Case(
         "two touching balls", Errors(0.06, 7.0, 0.01, 0.008), {"flipped": 0.2}
     ),
+    "a wire as thin as a pixel": Case(
+        "ball with an antenna", Errors(0.11, 7.0, 0.009, 0.006), {"pixel": 1 / 32}
+    ),
+    "LDR": Case("two touching balls", Errors(0.05, 10.0, 0.021, 0.008), {"response": "srgb"}),
+    "autocast to bfloat16": Case("two touching balls", Errors(0.055, 8.0, 0.01, 0.007), {"autocast": True}),
+    "paper-ngp": Case(
+        "two touching balls",
+        Errors(0.065, 5.0, 0.012, 0.011),
+        {"config": settings_of_paper_ngp(), "flipped": 0.0},
+    ),
 }
+NOT_RECOVERED = {
+    "cube that fills every frame": Case("cube", Errors(0.05, 15.0, 0.05, 0.02), {"frame": 0.7}),
+    "cameras in a room": Case("room", Errors(0.05, 15.0, 0.05, 0.02), {"inside": True}),
+}
+
+
+def check(case: Case) -> None:
+    found = learn(SHAPES[case.shape], 400, **case.options)
+    print(found)  # shown by pytest -rA
+    for measure in dataclasses.fields(Errors):
+        assert getattr(found, measure.name) <= getattr(case.largest, measure.name), found
 
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", CASES)
 def test_the_recovered_surface_is_accurate(name):
-    case = CASES[name]
-    found = learn(SHAPES[case.shape], 400, **case.options)
-    print(found)  # shown by pytest -rA
-    for measure in dataclasses.fields(Errors):
-        assert getattr(found, measure.name) <= getattr(case.largest, measure.name), found
+    check(CASES[name])
+
+
+@pytest.mark.hard
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="without outlines, points or a hull, geometry that starts as a ball does not find the surface "
+    "(docs/stability.md)",
+)
+@pytest.mark.parametrize("name", NOT_RECOVERED)
+def test_shapes_without_an_outline_are_recovered(name):
+    check(NOT_RECOVERED[name])

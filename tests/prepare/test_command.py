@@ -160,6 +160,23 @@ def test_a_stopped_command_prints_how_to_continue_and_continues(photos, tmp_path
     assert not (out / "images" / "000.exr").exists()
 
 
+def test_an_image_that_is_copied_when_the_command_ends_is_not_left_in_part(tmp_path, monkeypatch):
+    root, out, copyfile = make_capture(tmp_path / "posed"), tmp_path / "out", shutil.copyfile
+
+    def interrupted(source, target, **options):
+        if Path(target).parent != out / "images":
+            return copyfile(source, target, **options)
+        Path(target).write_bytes(Path(source).read_bytes()[:100])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfile", interrupted)
+        assert prepare(root, out) == 130
+    assert not list((out / "images").iterdir())
+    assert prepare(root, out) == 0
+    assert len(load_capture(out).views) == len(load_capture(root).views)
+
+
 def test_blurred_and_duplicate_photographs_are_left_out_with_auto(own, tmp_path, capsys):
     blurred, doubled = "004", "009"
     pixels = read_image(own / f"{blurred}.exr").pixels

@@ -1,7 +1,8 @@
-"""The vocabulary for the choice of image pairs."""
+"""The numbers of images in COLMAP's database, and the vocabulary for the choice of image pairs."""
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,11 +10,34 @@ import numpy as np
 import pytest
 
 from neilfpp_method.prepare import matching
-from neilfpp_method.prepare.matching import train_vocabulary
+from neilfpp_method.prepare.matching import extract_features, feature_counts, train_vocabulary
+from neilfpp_method.prepare.photos import survey
+from tests.prepare.textured_corner import make_photos
 
 
 class Killed(BaseException):
     """The end of the process in the middle of a file."""
+
+
+def test_images_are_numbered_in_the_order_of_the_photographs(tmp_path: Path, monkeypatch) -> None:
+    """COLMAP numbers them in the order in which its threads end. Here the second image is complete first."""
+    names = ["000", "001", "002"]
+    make_photos(tmp_path / "copies", len(names), (64, 48), hdr=False)
+    photos = survey(tmp_path / "copies", "auto").items
+    database, whole = tmp_path / "database.db", matching.pycolmap.extract_features
+
+    def second_first(database, copies, names, *options, **more):
+        for name in (names[1], names[0], *names[2:]):
+            whole(database, copies, [name], *options, **more)
+
+    monkeypatch.setattr(matching.pycolmap, "extract_features", second_first)
+    extract_features(database, tmp_path / "copies", photos, "shared", "SIMPLE_RADIAL", lambda *_: None)
+    with closing(matching.pycolmap.Database.open(database)) as opened:
+        images = sorted(opened.read_all_images(), key=lambda image: image.image_id)
+        assert [image.name for image in images] == [f"{name}.png" for name in names]
+        assert [image.camera_id for image in images] == [1, 1, 1]
+        assert opened.num_frames() == len(names)
+    assert all(feature_counts(database).values())
 
 
 def test_a_vocabulary_that_was_not_written_to_its_end_is_not_used_again(tmp_path: Path, monkeypatch) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from neilfpp_method.prepare.steps import begin, stamp
 
 
@@ -23,6 +25,22 @@ def test_other_inputs_start_with_an_empty_folder(tmp_path):
     fresh = begin(tmp_path / "a", size=4)
     assert fresh.result is None
     assert not (fresh.folder / "old").exists()
+
+
+def test_a_folder_that_is_half_emptied_is_not_complete(tmp_path, monkeypatch):
+    step = begin(tmp_path / "a", size=3)
+    (step.folder / "file").write_text("of size 3")
+    step.complete({})
+
+    def killed(folder):
+        (folder / "file").unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("neilfpp_method.prepare.steps.shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            begin(tmp_path / "a", size=4)
+    assert begin(tmp_path / "a", size=3).result is None
 
 
 def test_a_change_repeats_all_later_steps(tmp_path):

@@ -28,9 +28,11 @@ import trimesh
 from neilfpp_method.cli import main as neilfpp
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.errors import UserError
+from neilfpp_method.prepare.layout import WORK
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
 from tests.data.make_capture import make_capture
+from tests.prepare.textured_corner import make_photos
 from tests.train.small_runs import differences, small_config
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
@@ -188,6 +190,53 @@ def attack_command(report: Report, folder: Path, words: list[str], draw: random.
         report.faults.append(f"{words[0]} after kills: status {ended.status}: {ended.said[-800:]}")
 
 
+def attack_prepare(report: Report, folder: Path, draw: random.Random, kills: int) -> None:
+    """Kill `prepare` up to three times per capture, COLMAP's steps included, and let each capture finish.
+
+    The files of a capture must be those of one that was never interrupted, byte for byte.
+    """
+    photos, whole = folder / "photos", folder / "prepared"
+    make_photos(photos, views=4, size=(200, 150))
+
+    def words(out: Path) -> list[str]:
+        return ["prepare", str(photos), "--out", str(out), "--cloud", "dense"]
+
+    took = run(folder, *words(whole))
+    if took.status:
+        report.faults.append(f"prepare: cannot be run: {took.said[-800:]}")
+        return
+    wanted, number, done = capture_files(whole), 0, 0
+    while done < kills:
+        out, number = folder / f"prepared-{number}", number + 1
+        for _ in range(draw.randint(1, 3)):
+            kill = draw.choice(SIGNALS)
+            what, done = f"prepare, {kill.name}", done + 1
+            ended = run(folder, *words(out), kill=kill, after=draw.uniform(0.0, took.seconds))
+            report.kills[what] += 1
+            check_end(report, what, ended)
+            check_files(report, what, out)
+        ended = run(folder, *words(out))
+        if ended.status:
+            report.faults.append(f"prepare goes on: status {ended.status}: {ended.said[-800:]}")
+            continue
+        found = capture_files(out)
+        report.faults += [
+            f"prepare: {name} is not that of a capture that was never interrupted"
+            for name in sorted(wanted.keys() | found.keys())
+            if wanted.get(name) != found.get(name)
+        ]
+
+
+def capture_files(out: Path) -> dict[str, bytes]:
+    """The files of a prepared capture by name, without the work of its steps and unfinished files."""
+    inside = (path.relative_to(out) for path in out.rglob("*") if path.is_file())
+    return {
+        str(path): (out / path).read_bytes()
+        for path in inside
+        if path.parts[0] != WORK and not path.name.startswith(".")
+    }
+
+
 def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     PRESETS["tiny"] = small_config
     draw, report = random.Random(seed), Report()
@@ -198,6 +247,8 @@ def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     for name, *options in COMMANDS if each else ():
         words = [str(folder / SKY) if option == SKY else option for option in options]
         attack_command(report, folder, [name, str(whole), *words], draw, each)
+    if each:
+        attack_prepare(report, folder, draw, each)
     told = {"kills": dict(report.kills), "files": report.files, "faults": report.faults}
     report_file.write_text(json.dumps(told, indent=1))
 
