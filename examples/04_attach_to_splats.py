@@ -55,8 +55,7 @@ torch.manual_seed(0)
 host, red = Surfels(), torch.tensor([0.4, 0.1, 0.05])
 cameras = [camera_at(2.5 * np.array([np.cos(a), np.sin(a), 0.4])) for a in np.arange(0.0, 6.0, 1.0)]
 settings = preset("fast")
-# A small environment map that is fitted rarely keeps this example short.
-fit = LightFitConfig(points=128, every=30)
+fit = LightFitConfig(points=128, every=30)  # a small map that is fitted rarely keeps this example short
 settings = dataclasses.replace(
     settings,
     light=dataclasses.replace(settings.light, kind="distant", environment_height=8, fit=fit),
