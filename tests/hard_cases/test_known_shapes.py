@@ -35,10 +35,15 @@ PIXELS, HELD_BACK, RAYS = 20_000, 2_000, 192
 
 
 def settings() -> NeilfConfig:
-    """The preset `fast`, reduced to about ten milliseconds per step."""
+    """The preset `fast`, reduced to about ten milliseconds per step.
+
+    The mask loss has a tenth of the weight of `fast`. That weight suits a start from the visual hull; from a
+    ball it carves a wire away before it has been found (docs/stability.md).
+    """
     config = tiny_config()
     return dataclasses.replace(
         config,
+        loss=dataclasses.replace(config.loss, mask=0.1),
         host=dataclasses.replace(config.host, sdf=dataclasses.replace(config.host.sdf, width=32)),
         encoding=HashGridConfig(levels=4, log2_entries=13, sdf_log2_entries=13, max_resolution=64),
         radiance=dataclasses.replace(config.radiance, width=32),
@@ -189,19 +194,19 @@ class Case:
 
 
 CASES = {
-    "two touching balls": Case("two touching balls", Errors(0.05, 6.5, 0.01, 0.008)),
+    "two touching balls": Case("two touching balls", Errors(0.125, 7.5, 0.029, 0.013)),
     "thin plate": Case("thin plate", Errors(0.12, 12.0, 0.03, 0.012)),
     "wire": Case("wire", Errors(0.6, 26.0, 0.03, 0.012)),
     "crevice": Case("crevice", Errors(0.08, 14.0, 0.03, 0.015)),
     "concave bowl": Case("concave bowl", Errors(0.08, 12.5, 0.02, 0.012)),
-    "a twentieth of the frame": Case("a twentieth of the frame", Errors(0.4, 8.0, 0.01, 0.01)),
+    "a twentieth of the frame": Case("a twentieth of the frame", Errors(0.44, 8.6, 0.029, 0.01)),
     "two views": Case("two touching balls", Errors(0.3, 30.0, 0.09, 0.045), {"views": 2}),
     "noisy poses": Case("two touching balls", Errors(0.15, 12.5, 0.025, 0.018), {"pose_noise": 0.01}),
     "every fifth normal flipped": Case(
         "two touching balls", Errors(0.06, 7.0, 0.01, 0.008), {"flipped": 0.2}
     ),
     "a wire as thin as a pixel": Case(
-        "ball with an antenna", Errors(0.11, 7.0, 0.009, 0.006), {"pixel": 1 / 32}
+        "ball with an antenna", Errors(0.125, 7.5, 0.014, 0.007), {"pixel": 1 / 32}
     ),
     "LDR": Case("two touching balls", Errors(0.05, 10.0, 0.021, 0.008), {"response": "srgb"}),
     "autocast to bfloat16": Case("two touching balls", Errors(0.055, 8.0, 0.01, 0.007), {"autocast": True}),

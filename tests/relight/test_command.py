@@ -274,9 +274,7 @@ def test_figures_against_true_images(given, sky, tmp_path, capfd):
 
 def test_true_images_have_the_size_of_the_files(masked_capture, given, sky, tmp_path):
     """The images of a run that was trained at half the size are compared at full size."""
-    half = train_tiny(
-        masked_capture, tmp_path / "half", "--host", "mesh", "--scale", "0.5", config=few_steps
-    )
+    half = train_tiny(masked_capture, tmp_path / "half", "--host", "mesh", "--scale", "0.5", config=few_steps)
     assert relit(given, "--env", sky, "--out", tmp_path / "full") == 0
     truth = tmp_path / "full" / "studio"
     assert relit(half, "--env", sky, "--truth", truth) == 0
