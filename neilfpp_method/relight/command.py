@@ -115,7 +115,8 @@ def relight(
 def _shots(request: RelightRequest, run: Run) -> list[Shot]:
     capture = run.capture
     if request.is_turntable:
-        return turntable(capture, request.frames or FRAMES, request.scale, request.width)
+        frames = FRAMES if request.frames is None else request.frames
+        return turntable(capture, frames, request.scale, request.width)
     views = capture.chosen_views(request.views)
     return view_shots(capture, views, 1.0 if request.truth else request.scale, request.width)
 

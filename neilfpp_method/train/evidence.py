@@ -103,6 +103,8 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
     model, max_pixels = run.model, _max_light_pixels(run)
     if max_pixels < MIN_PIXELS or not is_search_due(model, position):
         return
+    if not (model.brdf.metals or run.plan.is_open("metals")):
+        return
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
         with timed("light_fits", undivided=True):

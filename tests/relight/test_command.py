@@ -332,6 +332,7 @@ def test_a_time_per_view_is_kept(given, sky, tmp_path):
         (["--lamp", "0=up"], ("--lamp 0=up", "x,y,z")),
         (["--lamp", "0=off", "--lamps", "drop"], ("--lamps drop",)),
         (["--views", "turntable", "--frames", "1"], ("1 frames",)),
+        (["--views", "turntable", "--frames", "0"], ("0 frames",)),
         (["--frames", "12"], ("--frames without --views turntable",)),
         (["--width", "100000"], ("100000×75000",)),
         (["--views", "turntable", "--truth", "x"], ("true images",)),
