@@ -36,6 +36,7 @@ __all__ = [
     "SearchedMaterial",
     "found_in",
     "is_search_due",
+    "is_search_time",
     "search_materials",
     "teach",
 ]
@@ -90,7 +91,12 @@ class SearchedMaterial:
 
 
 def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
-    """Whether materials are searched after `position.step` steps of a stage.
+    """Whether materials are searched after `position.step` steps of a stage: only if there are metals."""
+    return model.brdf.metals and is_search_time(model, position)
+
+
+def is_search_time(model: NeilfModel, position: StagePosition) -> bool:
+    """Whether materials can be compared after `position.step` steps of a stage.
 
     They never are if the light is no environment map, or if the settings leave out highlights.
     """

@@ -77,8 +77,7 @@ class PlaceSolver(nn.Module):
             if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
                 self._tried = True
                 self._start_light(model, light_solver)
-            is_due = model.brdf.metals and is_search_due(model, position)
-            if is_due and position.step != self._searched:
+            if is_search_due(model, position) and position.step != self._searched:
                 self._searched = position.step
                 summary = improve_material(model, self.places())
                 if summary is not None:

@@ -259,8 +259,7 @@ class NeilfMethod(Model):
     def _search_material(self, step: int) -> None:
         """Search for paint taken for metal when this is due, as in the standalone loop."""
         position = stage_at(step, self.config.neilf.train)
-        is_due = is_search_due(self.neilf, dataclasses.replace(position, step=position.step + 1))
-        if not (is_due and self.neilf.brdf.metals):
+        if not is_search_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
             return
         seed_stream(self.config.neilf.train.seed, Stream.SEARCH, step + 1)
         summary = improve_material(self.neilf, light_places(self.neilf, self.pixels.on(self.device)))

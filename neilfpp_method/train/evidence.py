@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.material_search import is_search_due
+from neilfpp_method.effects.material_search import is_search_time
 from neilfpp_method.effects.places import Places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
@@ -101,7 +101,7 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
     Both may train the BRDF field. The first process does this for all.
     """
     model, max_pixels = run.model, _max_light_pixels(run)
-    if max_pixels < MIN_PIXELS or not is_search_due(model, position):
+    if max_pixels < MIN_PIXELS or not is_search_time(model, position):
         return
     if not (model.brdf.metals or run.plan.is_open("metals")):
         return

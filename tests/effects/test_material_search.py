@@ -116,10 +116,11 @@ def test_a_search_is_due_once_at_each_of_its_times():
     assert not any(is_search_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
 
 
-def test_nothing_is_searched_under_a_free_light_or_without_highlights():
-    matte = sphere_model(preset("fast"))
+def test_nothing_is_searched_under_a_free_light_or_without_highlights_or_metals():
+    matte, painted = sphere_model(preset("fast")), sphere_model(preset("fast"))
     matte.lobe = None
-    for model in (matte, sphere_model(preset("paper-ngp"))):
+    painted.brdf.use(dataclasses.replace(painted.config.brdf, metals=False))
+    for model in (matte, painted, sphere_model(preset("paper-ngp"))):
         assert due_after(model, 30) == []
 
 

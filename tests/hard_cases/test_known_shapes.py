@@ -47,8 +47,10 @@ def settings() -> NeilfConfig:
 
 
 def with_weak_masks() -> NeilfConfig:
-    """`settings` with a tenth of the weight of the mask loss. The weight of `fast` suits a start from the visual
-    hull; from a ball it carves thin and small shapes away before they have been found (docs/stability.md).
+    """`settings` with a tenth of the weight of the mask loss.
+
+    The weight of `fast` suits a start from the visual hull; from a ball it carves thin and small shapes away
+    before they have been found (docs/stability.md).
     """
     return changed(settings(), {"loss.mask": 0.1})
 
