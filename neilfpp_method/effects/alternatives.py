@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.effects.measurement import Measurement, mean_of
+from neilfpp_method.effects.measurement import Measurement, mean_reduction
 from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.effects.place_fit import Permitted, fit_places, mean_errors
 
@@ -53,9 +53,5 @@ def reduction_in_held_back_views(
         by: what distinguishes the richer alternative, for the description of the measurement.
         worth: reduction above which the richer alternative is used.
     """
-    gains = []
-    for turn in range(turns):
-        before, after = (one.error(turn, folds) for one in (simple, rich))
-        gains.append(before - after)
-    gain = torch.stack(gains).nanmean(0)
-    return mean_of(gain[gain.isfinite()], f"reduction of the error in held-back views by {by}", worth)
+    errors = ((simple.error(turn, folds), rich.error(turn, folds)) for turn in range(turns))
+    return mean_reduction(errors, f"reduction of the error in held-back views by {by}", worth)

@@ -64,8 +64,7 @@ class LitPlaces:
 
     def hold_back(self, fold: int, folds: int) -> tuple[LitPlaces, LitPlaces]:
         """Known and held-back pixels: one fold of the views, numbered from 0 to `folds` − 1, is held back."""
-        is_held_back = self.places.view % folds == fold
-        known, held_back = torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
+        known, held_back = self.places.fold_rows(fold, folds)
         return self.where(known), self.where(held_back)
 
     def best(self, metallics: range) -> BestMaterials:
@@ -83,9 +82,7 @@ class LitPlaces:
 
     def mean_errors(self, material: Material) -> Float[Tensor, " P"]:
         """Mean relative error of the pixels of each place, clipped at 1; NaN for a place without pixels."""
-        has_pixels = torch.bincount(self.places.place, minlength=self.places.count) > 0
-        error = self.places.mean(self.error(material).abs().clamp_max(1).mean(-1))
-        return torch.where(has_pixels, error, torch.nan)
+        return self.places.mean_if_shown(self.error(material).abs().clamp_max(1).mean(-1))
 
     def loss(self, material: Material) -> Float[Tensor, " P"]:
         """The loss of `best_materials` for given materials."""

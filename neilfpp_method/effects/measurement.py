@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["MIN_SAMPLES", "Measurement", "mean_of"]
+__all__ = ["MIN_SAMPLES", "Measurement", "mean_of", "mean_reduction"]
 
 MIN_SAMPLES = 20
 """Minimum number of independent samples for a decision."""
@@ -64,3 +66,18 @@ def mean_of(values: Float[Tensor, " N"], what: str, threshold: float) -> Measure
         return Measurement(what, 0.0, 0.0, threshold, count)
     spread = values.double().std(correction=1).item() / count**0.5
     return Measurement(what, values.double().mean().item(), spread, threshold, count)
+
+
+def mean_reduction(
+    turns: Iterable[tuple[Float[Tensor, " P"], Float[Tensor, " P"]]], what: str, threshold: float
+) -> Measurement:
+    """The mean reduction of the error of places, each averaged over the turns first.
+
+    Args:
+        turns: for each fold that is held back, the error of each place without the effect and with it; NaN
+            for a place without held-back pixels.
+        what: description of the measurement.
+        threshold: reduction above which the effect is used.
+    """
+    reduction = torch.stack([without - with_effect for without, with_effect in turns]).nanmean(0)
+    return mean_of(reduction[reduction.isfinite()], what, threshold)

@@ -22,14 +22,14 @@ paint as well. Under the light of a half-trained model only metal has a gain (1.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.effects.alternatives import Alternative, reduction_in_held_back_views
 from neilfpp_method.effects.lit_places import METAL, PAINT, LitPlaces
 from neilfpp_method.effects.material_grid import BestMaterials
 from neilfpp_method.effects.material_search import SearchedMaterial, found_in
-from neilfpp_method.effects.measurement import Measurement, mean_of
+from neilfpp_method.effects.measurement import Measurement, mean_reduction
 from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.fields.brdf import BrdfField
 
@@ -74,16 +74,18 @@ def metals_evidence(data: PlaceData, response: str) -> Measurement:
 @torch.no_grad()
 def metals_evidence_in(lit: LitPlaces, response: str) -> Measurement:
     """The same as `metals_evidence`, under a fixed light."""
-    gains = []
-    for turn in range(FOLDS):
-        known, held_back = lit.hold_back(turn, FOLDS)
-        paint, metal = known.best(PAINT), known.best(METAL)
-        best = metal.where(_is_metal(paint, metal), paint)
-        gains.append(held_back.mean_errors(paint.material) - held_back.mean_errors(best.material))
-    gain = torch.stack(gains).nanmean(0)
+    errors = (_errors_in_held_back_views(lit, turn) for turn in range(FOLDS))
     what = "reduction of the error in held-back views by metals, under the trained light"
     worth = WORTH_IN_DISPLAY_VALUES if response == "srgb" else WORTH_UNDER_LIGHT
-    return mean_of(gain[gain.isfinite()], what, worth)
+    return mean_reduction(errors, what, worth)
+
+
+def _errors_in_held_back_views(lit: LitPlaces, turn: int) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """The error of each place with the best paint, and with metal where it is clearly better."""
+    known, held_back = lit.hold_back(turn, FOLDS)
+    paint, metal = known.best(PAINT), known.best(METAL)
+    best = metal.where(_is_metal(paint, metal), paint)
+    return held_back.mean_errors(paint.material), held_back.mean_errors(best.material)
 
 
 @torch.no_grad()

@@ -47,10 +47,8 @@ class PlaceData:
 
     def hold_back(self, fold: int, folds: int) -> Split:
         """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
-        is_held_back = self.places.view % folds == fold
-        return Split(
-            self.where(torch.nonzero(~is_held_back)[:, 0]), self.where(torch.nonzero(is_held_back)[:, 0])
-        )
+        known, held_back = self.places.fold_rows(fold, folds)
+        return Split(self.where(known), self.where(held_back))
 
 
 @dataclass(frozen=True)

@@ -162,9 +162,7 @@ def place_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " N"]:
 
 def mean_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " P"]:
     """Mean of `place_errors` for each place; NaN for a place without pixels."""
-    places = data.places
-    has_pixels = torch.bincount(places.place, minlength=places.count) > 0
-    return torch.where(has_pixels, places.mean(place_errors(fit, data)), torch.nan)
+    return data.places.mean_if_shown(place_errors(fit, data))
 
 
 def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:

@@ -73,6 +73,21 @@ class Places:
         pixels = torch.bincount(self.place, minlength=self.count).clamp_min(1)
         return sums / pixels.view(-1, *[1] * (values.ndim - 1))
 
+    def mean_if_shown(self, values: Float[Tensor, " N"]) -> Float[Tensor, " P"]:
+        """The same, but NaN for a place without pixels."""
+        has_pixels = torch.bincount(self.place, minlength=self.count) > 0
+        return torch.where(has_pixels, self.mean(values), torch.nan)
+
+    def fold_rows(self, fold: int, folds: int) -> tuple[Int[Tensor, " K"], Int[Tensor, " H"]]:
+        """Indices of the pixels of known and of held-back views.
+
+        Args:
+            fold: the fold of the views that is held back, from 0 to `folds` − 1.
+            folds: number of folds.
+        """
+        is_held_back = self.view % folds == fold
+        return torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
+
     def shared_points(self) -> SharedPoints:
         """One point per place, the mean of the points that its pixels show, from which rays are traced."""
         position, normal = self.mean(self.observed.position), self.mean(self.observed.normal)

@@ -29,33 +29,33 @@ MAX_BOUNCES = 64
 
 @dataclass(frozen=True)
 class RelightRequest:
-    """Options of the command; `commands.relight.Relight` documents the fields."""
+    """Options of the command, with its defaults; `commands.relight.Relight` documents the fields."""
 
     run: Path
-    env: tuple[Path, ...]
-    env_layout: Layout
-    rotate: float
-    exposure: float
-    lamps: str
-    lamp_edits: tuple[str, ...]
-    views: tuple[str, ...]
-    frames: int | None
-    edits: tuple[str, ...]
-    box: tuple[float, ...] | None
-    mask: tuple[Path, ...]
-    spp: int | None
-    seconds: float | None
-    bounces: int
-    scale: float | None
-    width: int | None
-    background: str
-    denoise: bool
-    truth: tuple[Path, ...]
-    out: Path | None
-    resolution: int
-    force: bool
-    checkpoint: str
-    device: str
+    env: tuple[Path, ...] = ()
+    env_layout: Layout = "ours"
+    rotate: float = 0.0
+    exposure: float = 0.0
+    lamps: str = "auto"
+    lamp_edits: tuple[str, ...] = ()
+    views: tuple[str, ...] = ("test",)
+    frames: int | None = None
+    edits: tuple[str, ...] = ()
+    box: tuple[float, ...] | None = None
+    mask: tuple[Path, ...] = ()
+    spp: int | None = None
+    seconds: float | None = None
+    bounces: int = 6
+    scale: float | None = None
+    width: int | None = None
+    background: str = "transparent"
+    denoise: bool = False
+    truth: tuple[Path, ...] = ()
+    out: Path | None = None
+    resolution: int = 512
+    force: bool = False
+    checkpoint: str = "last"
+    device: str = "auto"
 
     @property
     def is_turntable(self) -> bool:

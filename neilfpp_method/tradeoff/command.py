@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 from rich.console import Console
 
@@ -52,10 +53,11 @@ def run_tradeoff(
         Stopped, KeyboardInterrupt: if the user stops the command; the next call continues it.
     """
     out = request.out
-    plan_runs(request)
+    runs = plan_runs(request)
     # Errors in the capture are raised before anything is written.
     capture = load_capture(request.data)
-    runs = plan_runs(request, plan_relighting(request.relight, request.truth, request.env_layout, capture))
+    light = plan_relighting(request.relight, request.truth, request.env_layout, capture)
+    runs = [replace(run, light=light) for run in runs]
     check_folder(out)
     for run in runs:
         check_same(run)

@@ -90,12 +90,8 @@ class PlannedRun:
         return self.out.name
 
 
-def plan_runs(request: TradeoffRequest, light: Relighting | None = None) -> list[PlannedRun]:
+def plan_runs(request: TradeoffRequest) -> list[PlannedRun]:
     """Plan a run for each budget and seed, by budget, with the folders `OUT/10m-seed0` and so on.
-
-    Args:
-        request: the runs.
-        light: light under which all runs are compared with true images.
 
     Raises:
         UserError: if there is no budget, a budget occurs twice, or `seeds` is less than 1.
@@ -111,7 +107,7 @@ def plan_runs(request: TradeoffRequest, light: Relighting | None = None) -> list
         for seed in range(config.train.seed, config.train.seed + request.seeds):
             out = request.out / f"{format_duration(budget)}-seed{seed}"
             seeded = replace(config, train=replace(config.train, seed=seed))
-            runs.append(PlannedRun(request.data, out, seeded, effects, budget, light))
+            runs.append(PlannedRun(request.data, out, seeded, effects, budget))
     return runs
 
 

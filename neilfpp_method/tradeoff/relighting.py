@@ -18,9 +18,6 @@ from neilfpp_method.report.measured import is_outdated
 
 __all__ = ["Relighting", "has_relit", "metrics_path", "plan_relighting", "relight_run"]
 
-BOUNCES, RESOLUTION = 6, 512
-"""Defaults of `neilfpp relight`: surfaces on a light path, and cells of the traced mesh along an edge."""
-
 
 @dataclass(frozen=True)
 class Relighting:
@@ -77,8 +74,8 @@ def has_relit(run: Path, light: Relighting) -> bool:
 
 
 def relight_run(run: Path, light: Relighting, device: str, say: Callable[[str], None]) -> None:
-    """Relight the test views of a run in full size and write the figures, with the settings of `neilfpp
-    relight --env MAP --truth DIR`. Images that exist are kept.
+    """Relight the test views of a run in full size and write the figures, as `neilfpp relight --env MAP
+    --truth DIR` does. Images that exist are kept.
 
     Raises:
         UserError: for example if the run has no material or no surface.
@@ -87,27 +84,8 @@ def relight_run(run: Path, light: Relighting, device: str, say: Callable[[str], 
         run=run,
         env=(light.env,),
         env_layout=light.layout,
-        rotate=0.0,
-        exposure=0.0,
-        lamps="auto",
-        lamp_edits=(),
-        views=("test",),
-        frames=None,
-        edits=(),
-        box=None,
-        mask=(),
-        spp=None,
-        seconds=None,
-        bounces=BOUNCES,
-        scale=None,
-        width=None,
-        background="transparent",
-        denoise=False,
         truth=(light.truth,),
         out=metrics_path(run, light).parent.parent,
-        resolution=RESOLUTION,
-        force=False,
-        checkpoint="last",
         device=device,
     )
     relight(request, say)
