@@ -30,7 +30,7 @@ MARGIN = 1.1
 """Ratio of the size of the box to the extent of its points."""
 MIN_POINTS = 20
 """Smallest number of points from which a box is computed."""
-CELLS = 32
+CELLS = 48
 """Grid points along each axis of the visual hull."""
 
 REFINEMENTS = 3
@@ -155,18 +155,22 @@ def _box(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> Nor
 
 
 def _carve(outlines: Sequence[Outline], start: Normalization) -> Normalization:
-    """The box of the visual hull: of the points in nearly all silhouettes, on successively finer grids."""
+    """The box of the visual hull, from successively finer grids.
+
+    A cell is kept if nearly all silhouettes contain a part of it. Its centre alone would miss thin parts: the
+    legs of a chair, and with them half of its height.
+    """
     center, half = np.array(start.center), np.full(3, start.scale)
     low, high = center - half, center + half
     for _ in range(REFINEMENTS):
         axes = [np.linspace(a, b, CELLS) for a, b in zip(low, high, strict=True)]
         cell = (high - low) / (CELLS - 1)
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        held = grid[agreement(outlines, grid) >= AGREEMENT]
+        held = grid[agreement(outlines, grid, reach=float(np.linalg.norm(cell)) / 2) >= AGREEMENT]
         if not len(held):
             raise UserError(
                 "no point of the scene lies in all masks",
                 "check the cameras and the masks, which are white on the object, or add a scene box",
             )
         low, high = held.min(axis=0) - cell, held.max(axis=0) + cell
-    return _box(low, high)
+    return _box(held.min(axis=0), held.max(axis=0))

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from neilfpp_method.data.camera import scaled_camera
 from neilfpp_method.data.images import read_image
-from neilfpp_method.data.projection import pixel_index, project
+from neilfpp_method.data.projection import Projection, pixel_index, project
 from neilfpp_method.data.views import View
 
 __all__ = [
@@ -45,6 +46,11 @@ class Outline:
     def complete(self) -> bool:
         mask = self.inside
         return not (mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any())
+
+    @cached_property
+    def distance(self) -> Float32[np.ndarray, "H W"]:
+        """Distance of each pixel from the nearest pixel of the silhouette, in pixels; 0 inside."""
+        return cv2.distanceTransform(np.uint8(~self.inside), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def read_outlines(
@@ -82,29 +88,76 @@ def outline_of(view: View, mask: Bool[np.ndarray, "H W"], max_side: int = MAX_SI
 
 @dataclass(frozen=True)
 class SilhouetteCounts:
-    """For each of P points, the number of views that see it and the number of silhouettes that contain it."""
+    """For each of P points or balls, the number of views that see it, and of those whose silhouette contains
+    it or, for a ball, a part of it.
+    """
 
     visible_in: Int64[np.ndarray, " P"]
     inside: Int64[np.ndarray, " P"]
 
 
-def sightings(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> SilhouetteCounts:
-    """Count views and silhouettes for points in the frame of the cameras."""
+def sightings(
+    outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"], reach: float = 0.0
+) -> SilhouetteCounts:
+    """Count views and silhouettes for points, or for the balls around them.
+
+    A grid of points misses parts that are thinner than its cells. Balls that cover the cells do not: if the
+    silhouettes contain a point of a ball, they are counted for the ball.
+
+    Args:
+        outlines: the silhouettes.
+        points: points in the frame of the cameras.
+        reach: radius of the balls, in units of that frame; 0 for the points themselves. A view sees a ball if
+            all of it lies in the image, or if the silhouette is `complete`.
+    """
     visible_in, inside = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     for outline in outlines:
         camera = outline.view.camera
-        index = pixel_index(project(camera, torch.from_numpy(points)), camera).numpy()
-        in_image = index >= 0
-        visible_in += in_image | outline.complete
-        inside += in_image & outline.inside.ravel()[index]
+        projected = project(camera, torch.from_numpy(points))
+        if reach > 0:
+            visible, contained = _balls(outline, projected, reach)
+        else:
+            index = pixel_index(projected, camera).numpy()
+            visible = (index >= 0) | outline.complete
+            contained = (index >= 0) & outline.inside.ravel()[index]
+        visible_in += visible
+        inside += contained
     return SilhouetteCounts(visible_in, inside)
 
 
-def agreement(outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, " P"]:
+def _balls(
+    outline: Outline, projected: Projection, reach: float
+) -> tuple[Bool[np.ndarray, " P"], Bool[np.ndarray, " P"]]:
+    """Which balls a view sees, and which of these its silhouette may contain a part of.
+
+    The projection of a ball is bounded by a disc, so a silhouette near a ball may be counted, too.
+    """
+    camera = outline.view.camera
+    size = np.array([camera.width, camera.height])
+    depth = projected.depth.numpy()
+    pixel = np.nan_to_num(projected.pixel.numpy(), posinf=1e9, neginf=-1e9)
+    around_camera = np.abs(depth) <= reach
+    radius = max(camera.fx, camera.fy) * reach / np.where(depth > reach, depth - reach, np.inf)
+    nearest = np.clip(pixel.astype(np.int64), 0, size - 1)
+    beside = np.linalg.norm(pixel - (nearest + 0.5), axis=1)
+    # Both are lower bounds of the distance from the silhouette, the second one beside the image.
+    gap = np.maximum(outline.distance[nearest[:, 1], nearest[:, 0]] - beside, beside - 1.0)
+    touches = around_camera | ((depth > reach) & (gap <= radius))
+    in_image = (depth > reach) & ((pixel >= radius[:, None]) & (pixel <= size - radius[:, None])).all(1)
+    visible = in_image | outline.complete
+    return visible, visible & touches
+
+
+def agreement(
+    outlines: Sequence[Outline], points: Float64[np.ndarray, "P 3"], reach: float = 0.0
+) -> Float64[np.ndarray, " P"]:
     """Return the share of the views seeing a point whose silhouette contains it; 0 if fewer than half see it.
 
-    Points are in the frame of the cameras.
+    Args:
+        outlines: the silhouettes.
+        points: points in the frame of the cameras.
+        reach: if above 0, balls of this radius are examined in place of the points, see `sightings`.
     """
-    counts = sightings(outlines, points)
+    counts = sightings(outlines, points, reach)
     share = counts.inside / np.maximum(counts.visible_in, 1)
     return np.where(counts.visible_in >= len(outlines) / 2, share, 0.0)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
 
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.images import write_png
@@ -124,6 +125,48 @@ def test_a_hole_that_is_visible_in_views_is_open():
     hull = find_hull([*ring(30), *bored], resolution=48)
     assert hull.at(torch.zeros(1, 3)) > 0
     assert (hull.at(torch.tensor([[0.4, 0.0, 0.0], [0.0, -0.4, 0.0]])) < -0.05).all()
+
+
+def rod(camera: Camera, end: Sequence[float], radius: float) -> np.ndarray:
+    """The silhouette of a thin rod from −end to end: what lies within its projected radius of its axis."""
+    axis = np.linspace(-1, 1, 2000)[:, None] * np.asarray(end)
+    local = axis @ camera.w2c[:3, :3].T + camera.w2c[:3, 3]
+    pixel = local[:, :2] / local[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
+    centers = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    offset, nearest = cKDTree(pixel).query(centers)
+    inside = offset < camera.fx * radius / local[nearest, 2]
+    return inside.reshape(rows.shape)
+
+
+def test_a_rod_of_three_cells_belongs_to_the_hull_along_its_whole_length():
+    end, radius = [0.1, 0.3, 0.9], 0.02
+    outlines = [replace(o, inside=rod(o.view.camera, end, radius)) for o in ring(24, size=360, focal=540.0)]
+    hull = find_hull(outlines)
+    assert isinstance(hull, DistanceCube)
+    along = torch.linspace(-0.95, 0.95, 200)[:, None] * torch.tensor(end)
+    assert (hull.at(along) < 0).float().mean() > 0.9
+    beside = along + 0.06 * torch.tensor([0.9487, -0.3162, 0.0])
+    assert (hull.at(beside) > 0.02).all()
+
+
+def test_a_ball_is_counted_wherever_one_of_its_points_is():
+    outlines = [replace(o, inside=rod(o.view.camera, [0.1, 0.3, 0.9], 0.02)) for o in ring(6)]
+    # The image of a close-up ends within the rod: beside it, the view knows nothing.
+    outlines += [
+        replace(o, inside=rod(o.view.camera, [0.1, 0.3, 0.9], 0.02)) for o in ring(6, focal=5.0 * SIZE)
+    ]
+    assert not outlines[-1].complete
+    centers, reach = random_points(400, 1.2).double().numpy(), 0.1
+    inner = reach * torch.nn.functional.normalize(random_points(400, 1.0).double(), dim=-1).numpy()
+    for outline in outlines:
+        ball = sightings([outline], centers, reach)
+        for share in (0.0, 0.5, 0.99):
+            point = sightings([outline], centers + share * inner)
+            assert (ball.inside >= point.inside)[ball.visible_in == 1].all()
+            assert (point.visible_in >= ball.visible_in).all()
+    far = sightings(outlines[:1], np.array([[0.9, 0.0, 0.0], [0.0, 0.0, 9.0]]), reach)
+    assert far.inside.tolist() == [0, 0]
 
 
 def test_masks_without_a_hull_are_reported():
