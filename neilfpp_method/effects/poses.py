@@ -27,7 +27,7 @@ JUDGED_VIEWS = 10
 """Maximum number of views in which poses are judged."""
 JUDGED_PIXELS = 192
 """Mean number of pixels per judged view."""
-FITTED_PIXELS = 96
+FITTED_PIXELS = 192
 """Mean number of pixels per view in a fit of all poses."""
 
 
