@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, PoseCorrections, at_mean_exposure, make_light
+from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
+from neilfpp_method.fields.poses import PoseCorrections
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import Sources, arriving, incident_radiance, scene_tracer, trace_light

@@ -1,8 +1,8 @@
 """Evidence for errors of the camera poses: poses are fitted to some pixels and judged at others.
 
-If geometry and radiance have been learned from inaccurate poses, they agree on a mean of the photographs, from
-which each photograph is displaced. A correction of its pose then reduces the error also at pixels to which it
-was not fitted. If the poses are accurate, a correction only follows errors of the geometry and the radiance.
+If geometry and radiance have been learned from inaccurate poses, they agree on a mean of the photographs,
+from which each photograph is displaced. A correction of its pose then reduces the error also at pixels to
+which it was not fitted. If the poses are accurate, a correction only follows errors of the geometry and the radiance.
 """
 
 from __future__ import annotations

@@ -278,9 +278,7 @@ def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Wat
     return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
 
 
-def _preview(
-    out: Path, fabric: Fabric, reporter: Reporter
-) -> Callable[[NeilfModel, Capture, Stage], None]:
+def _preview(out: Path, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Capture, Stage], None]:
     def preview(model: NeilfModel, capture: Capture, stage: Stage) -> None:
         if fabric.is_global_zero:
             pixels = write_preview(model, capture, stage, out / "previews" / f"{stage.value}.png")

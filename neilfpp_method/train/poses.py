@@ -23,8 +23,8 @@ from neilfpp_method.structures import PixelBatch
 __all__ = ["GivenCameras", "camera_centers", "corrected", "is_fit_due"]
 
 FIRST, LAST = 0.3, 0.9
-"""Shares of SDF init at which poses are fitted for the first and the last time. Before, R is too blurred; after,
-G and R adapt to the final poses.
+"""Shares of SDF init at which poses are fitted for the first and the last time. Before, R is too blurred;
+after, G and R adapt to the final poses.
 """
 
 

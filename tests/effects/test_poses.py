@@ -1,8 +1,6 @@
-"""Inaccurate camera poses: they are detected, corrected by alignment, and applied wherever cameras are used."""
+"""Inaccurate camera poses are detected, corrected by alignment, and applied wherever cameras are used."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest

@@ -50,7 +50,9 @@ def test_a_stop_between_fits_changes_nothing(tmp_path, capture, monkeypatch):
                 )
     run(None, tmp_path / "run", resume=True)
     assert differences(state(tmp_path / "run"), state(tmp_path / "whole")) == []
-    checks = [json.loads((tmp_path / name / "quality.json").read_text())["checks"] for name in ("run", "whole")]
+    checks = [
+        json.loads((tmp_path / name / "quality.json").read_text())["checks"] for name in ("run", "whole")
+    ]
     assert [c["radiance"] for c in checks[0]] == [c["radiance"] for c in checks[1]]
     assert state(tmp_path / "run", "sdf_init")["model"]["poses.rotation"].abs().max() > 0
 
@@ -118,7 +120,7 @@ def test_poses_that_evidence_switches_off_stay_as_given(tmp_path, capture, monke
     assert not load_run(tmp_path / "run").model.poses.rotation.any()
 
 
-# ---------------------------------------------------------------------------------------- a scene with noisy poses
+# ----------------------------------------------------------------------------------- a scene with noisy poses
 
 SHAPE, SIDE, VIEWS, DISTANCE = "crevice", 48, 16, 3.0
 
@@ -140,11 +142,15 @@ def photographed(root: Path, noise: PoseMotion) -> Capture:
         local = np.stack([(u - SIDE / 2) / focal, (v - SIDE / 2) / focal, np.ones_like(u)], -1).reshape(-1, 3)
         origins = np.broadcast_to(DISTANCE * outward, local.shape)
         seen = meet(SHAPES[SHAPE], origins, local @ w2c[:3, :3])
-        color = np.where(seen.hit[:, None], seen.color * (1 + 0.5 * np.sin(15 * seen.position)), 0.0)
-        write_exr(root / f"inputs/images/{i:03d}.exr", {"RGB": color.reshape(SIDE, SIDE, 3).astype(np.float32)})
+        color = seen.color * (1 + 0.5 * np.sin(15 * seen.position)) * seen.hit[:, None]
+        image = color.reshape(SIDE, SIDE, 3).astype(np.float32)
+        write_exr(root / f"inputs/images/{i:03d}.exr", {"RGB": image})
         mask = np.where(seen.hit, 255, 0).astype(np.uint8).reshape(SIDE, SIDE)
         write_png(root / f"inputs/masks/{i:03d}.png", mask)
-        camera = {"intrinsic": {"focal": [focal] * 2, "ppt": [SIDE / 2] * 2}, "extrinsic": w2c.ravel().tolist()}
+        camera = {
+            "intrinsic": {"focal": [focal] * 2, "ppt": [SIDE / 2] * 2},
+            "extrinsic": w2c.ravel().tolist(),
+        }
         tracks[str(i)] = {"flg": 2, "size": [SIDE, SIDE], "camera": camera}
         files[str(i)] = f"images/{i:03d}.exr"
     scene = {"camera_track_map": {"images": tracks}, "image_path": {"file_paths": files}}
