@@ -2,7 +2,7 @@
 
 If geometry and radiance have been learned from inaccurate poses, they agree on a mean of the photographs,
 from which each photograph is displaced. A correction of its pose then reduces the error also at pixels to
-which it was not fitted. If the poses are accurate, a correction only follows errors of the geometry and the radiance.
+which it was not fitted. If the poses are accurate, a correction only follows errors of G and R.
 """
 
 from __future__ import annotations
