@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from neilfpp_method import losses
 from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
+from neilfpp_method.fields.poses import PoseCorrections
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import Sources, arriving, incident_radiance, scene_tracer, trace_light
@@ -68,6 +69,8 @@ class NeilfModel(nn.Module):
         brdf: B, the material at every point.
         light, lamps: L, the light that arrives at unoccluded points, and the small lamps near the scene.
         gains: gain of each photograph relative to the mean; None if all are assumed to have one exposure.
+        poses: corrections of the training cameras; None if their poses are as given. The model gets rays of
+            corrected cameras, it only keeps the corrections for checkpoints.
         lobe: distribution of the specular reflection; None for Lambertian surfaces.
         stages: stage table for this kind of host: active losses and trained fields of each stage.
         units: units in which the losses measure radiance.
@@ -95,6 +98,7 @@ class NeilfModel(nn.Module):
         self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
+        self.poses: PoseCorrections | None = None
         # The light starts at the radiance under which the initial material has the images' median radiance.
         albedo = initial_albedo(
             config.brdf.initial_base_color, config.brdf.initial_metallic, _specular_lobe(config.shading)

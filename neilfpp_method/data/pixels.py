@@ -98,6 +98,13 @@ class PixelDataset:
         other._rays = CameraRays(cameras, device)
         return other
 
+    def posed(self, capture: Capture) -> PixelDataset:
+        """Return the same pixels with the poses of the views of the same names in another capture."""
+        other, views = copy.copy(self), {view.name: view for view in capture.views}
+        other.capture, other.views = capture, tuple(views[view.name] for view in self.views)
+        other._rays = self._rays.posed([capture.scene_camera(view) for view in other.views])
+        return other
+
     def __len__(self) -> int:
         return len(self.store)
 
@@ -115,6 +122,10 @@ class PixelDataset:
     def draw(self, count: int) -> Int[Tensor, " count"]:
         """Draw the indices of the pixels that `sample` would return, from 0 to P − 1."""
         return self._draws.draw(count)
+
+    def view_of(self, numbers: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+        """Return the index of the view of each pixel."""
+        return torch.from_numpy(self._views_of(numbers.cpu().numpy()))
 
     def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
         """Exclude pixels from all later draws; see `data.held_back`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -103,6 +104,13 @@ class CameraRays:
             )
             planes = np.concatenate([_whole_plane(camera, dtype) for camera in kinds.values()])
             self._lens_plane = torch.from_numpy(planes).to(device)
+
+    def posed(self, cameras: Sequence[Camera]) -> CameraRays:
+        """Return the rays of cameras that differ from these only in their poses."""
+        other = copy.copy(self)
+        other._c2w = torch.tensor(np.stack([c.c2w for c in cameras])).to(self._c2w)
+        other._cameras = tuple(cameras)
+        return other
 
     def has_ray(self, i: int) -> Bool[Tensor, " P"]:
         """Return which pixels of camera `i`, row by row, have a ray: its lens shows something there."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.settings.presets import EXPOSURE_RATE
+from neilfpp_method.settings.presets import EXPOSURE_RATE, POSE_FITS
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig, MeshConfig, NeilfConfig
 
 __all__ = ["EFFECTS", "Effect", "switched"]
@@ -98,6 +98,12 @@ def _joint_obstacle(config: NeilfConfig) -> str:
     if isinstance(config.host, MeshConfig):
         return "the surface is given, so material and R are trained together from the start"
     return "" if config.train.joint_steps else "the settings give it no steps (train.joint_steps)"
+
+
+def _pose_obstacle(config: NeilfConfig) -> str:
+    if isinstance(config.host, MeshConfig):
+        return "the surface is given, and poses are fitted only while it is trained"
+    return "" if config.train.sdf_steps else "poses are fitted in SDF init, which has no steps"
 
 
 UNKNOWN_IN_FREE_LIGHT = "not measured: a light that is free at every point can explain any material"
@@ -247,6 +253,17 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_none,
             cost=lambda config: "three unknowns per photograph",
             risk="differences of exposure become gloss, fog and uneven light",
+        ),
+        Effect(
+            name="poses",
+            title="errors of the camera poses",
+            is_on=lambda config: config.train.pose_fits > 0,
+            on=lambda config: {"train.pose_fits": config.train.pose_fits or POSE_FITS},
+            off={"train.pose_fits": 0},
+            obstacle=_pose_obstacle,
+            cost=lambda config: f"{config.train.pose_fits} fits of all cameras while G is trained",
+            risk="surfaces and colours are blurred",
+            earned=True,
         ),
         Effect(
             name="response",

@@ -22,6 +22,7 @@ from neilfpp_method.effects.metals import find_metal, metals_evidence, metals_ev
 from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.places import Places, gather_places
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.poses import pose_evidence
 from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
 from neilfpp_method.model import NeilfModel
@@ -44,6 +45,7 @@ __all__ = [
     "review_light",
     "review_material",
     "review_metals",
+    "review_poses",
     "review_surface",
 ]
 
@@ -207,6 +209,19 @@ def review_metals(plan: Plan, model: NeilfModel, places: Places, step: int) -> l
     if decision.on:
         model.use(plan.config)
         teach(model.brdf, find_metal(lit, model.brdf))
+    return [decision]
+
+
+def review_poses(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
+    """Decide once whether poses are corrected, if this is open. The arguments are those of `review_surface`.
+
+    Args:
+        pixels: the training pixels with poses as given.
+    """
+    if not plan.is_open("poses") or plan.newest("poses") is not None:
+        return []
+    decision = plan.decide("poses", pose_evidence(model, pixels), step)
+    model.use(plan.config)
     return [decision]
 
 

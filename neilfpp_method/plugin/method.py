@@ -12,6 +12,7 @@ from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig
 from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.plugin.model import FieldAdamConfig, NeilfMethodConfig
 from neilfpp_method.schedule import GEOMETRY, MATERIAL, total_steps
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import fixed_geometry, preset
 from neilfpp_method.settings.types import NeilfConfig
 
@@ -45,7 +46,7 @@ def trainer(name: str, settings: NeilfConfig) -> TrainerConfig:
 
 
 neilfpp = MethodSpecification(
-    trainer("neilfpp", preset("fast")),
+    trainer("neilfpp", changed(preset("fast"), {"train.pose_fits": 0})),
     "NeILF++: geometry, material and incident light by inter-reflectable light fields.",
 )
 neilfpp_mesh = MethodSpecification(

@@ -82,7 +82,9 @@ class NeilfMethodConfig(ModelConfig):
     host_losses: float = 1.0
     """Weight of the regularisers of `host`. With 0 they are replaced by L_Eik if it is a surface model."""
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
-    """The settings of the method. Of `train`, only the seed and the steps of the stages are used."""
+    """The settings of the method. Of `train`, only the seed and the steps of the stages are used;
+    nerfstudio's own camera optimizer can correct poses.
+    """
 
 
 class NeilfMethod(Model):

@@ -13,10 +13,12 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import FrequencyConfig, MeshConfig, NeilfConfig
 
-__all__ = ["EXPOSURE_RATE", "PRESETS", "fixed_geometry", "free_light", "preset"]
+__all__ = ["EXPOSURE_RATE", "POSE_FITS", "PRESETS", "fixed_geometry", "free_light", "preset"]
 
 EXPOSURE_RATE = 1e-3
 """Learning rate of the log gains of photographs, if they are trained: 1 % takes Adam about ten steps."""
+POSE_FITS = 12
+"""Fits of the camera poses, if they are corrected. Each improves on the poses of the one before."""
 SINE_FREQUENCY = 30.0
 """ω of the sine layers sin(ω (W x + b)) of B and L. In the published code ω is part of W and b, so a step
 of Adam there corresponds to a step of 1/ω here.
@@ -160,6 +162,7 @@ FAST: Mapping[str, Any] = {
     "optimizer.joint": 0.1,
     "optimizer.background_from": 0.5,
     "train.sdf_steps": 2_000,
+    "train.pose_fits": POSE_FITS,
     "train.material_steps": 3_000,
     "train.joint_steps": 300,
     "train.rays": 512,
@@ -285,6 +288,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         "train.sdf_steps": train.sdf_steps // 10,
         "train.material_steps": train.material_steps + train.joint_steps,
         "train.joint_steps": 0,
+        "train.pose_fits": 0,
     }
     if config.light.kind != "free":
         mesh["light.fit.every"] = 100

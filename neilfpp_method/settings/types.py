@@ -341,6 +341,8 @@ class TrainConfig:
     """Steps of the second stage, material init."""
     joint_steps: int = 20_000
     """Steps of the joint stage. 0 is the paper's separate pipeline ("Sep.")."""
+    pose_fits: int = 0
+    """Times that camera poses are fitted to the photographs in SDF init. 0: poses are as given."""
     rays: int = 4096
     """Rays per step and process."""
     fresh: float = 1.0

@@ -19,6 +19,7 @@ from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.effects.exposure import Exposures, measure_exposures
 from neilfpp_method.errors import UserError
+from neilfpp_method.fields import PoseCorrections
 from neilfpp_method.hosts.base import Host
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.hosts.volsdf import VolSdfHost
@@ -110,7 +111,10 @@ def build_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> Nei
         UserError: if the settings name a mesh that the capture does not have, or if no point of its point
             cloud lies in the scene.
     """
-    return NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
+    model = NeilfModel(HOSTS[config.host.kind](capture, facts, config), config, facts)
+    if config.train.pose_fits:
+        model.poses = PoseCorrections(len(capture.train_views))
+    return model
 
 
 def initial_model(capture: Capture, facts: SceneFacts, config: NeilfConfig) -> NeilfModel:

@@ -260,7 +260,7 @@ def _train(
             fabric=fabric,
             reporter=reporter,
             should_stop=stopped,
-            preview=_preview(run.out, run.capture, fabric, reporter),
+            preview=_preview(run.out, fabric, reporter),
             continue_with=continue_with,
             light_solver=prepared.model.light_solver(),
             watch=_watch(pixels, config, reporter),
@@ -278,10 +278,8 @@ def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Wat
     return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
 
 
-def _preview(
-    out: Path, capture: Capture, fabric: Fabric, reporter: Reporter
-) -> Callable[[NeilfModel, Stage], None]:
-    def preview(model: NeilfModel, stage: Stage) -> None:
+def _preview(out: Path, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Capture, Stage], None]:
+    def preview(model: NeilfModel, capture: Capture, stage: Stage) -> None:
         if fabric.is_global_zero:
             pixels = write_preview(model, capture, stage, out / "previews" / f"{stage.value}.png")
             reporter.picture(0, f"preview/{stage.value}", pixels)

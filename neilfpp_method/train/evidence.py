@@ -13,6 +13,7 @@ from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.material_search import is_search_time
 from neilfpp_method.effects.places import Places
 from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.poses import next_motion
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
     MIN_PIXELS,
@@ -23,6 +24,7 @@ from neilfpp_method.effects.review import (
     review_light,
     review_material,
     review_metals,
+    review_poses,
     review_surface,
 )
 from neilfpp_method.model import NeilfModel
@@ -31,9 +33,17 @@ from neilfpp_method.structures import StepResult
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import Stream, seed_stream
+from neilfpp_method.train.poses import camera_centers, corrected, is_fit_due
 from neilfpp_method.train.training import Training
 
-__all__ = ["apply_plan", "observe_and_solve", "review_before_stage", "search_material"]
+__all__ = [
+    "apply_plan",
+    "apply_poses",
+    "fit_poses",
+    "observe_and_solve",
+    "review_before_stage",
+    "search_material",
+]
 
 Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
 """Measures with the model after so many steps and adds its decisions to the plan."""
@@ -93,6 +103,40 @@ def _start_light(run: Training, step: int) -> None:
             _report(run, record_lamps(run.plan, evidence, model.lamps.count, step))
     _share_light(run)
     _share_decisions(run, decisions)
+
+
+def fit_poses(run: Training, position: StagePosition, step: int) -> None:
+    """When it is due, fit the poses of the training cameras, after a decision whether that is needed.
+
+    The first process does this for all.
+    """
+    model, poses = run.model, run.model.poses
+    if poses is None or not is_fit_due(model.config.train.pose_fits, position):
+        return
+    decisions: list[Decision] = []
+    motion = poses.motion
+    if run.fabric.is_global_zero:
+        with timed("checks", undivided=True):
+            seed_stream(run.config.train.seed, Stream.POSES, step)
+            decisions = review_poses(run.plan, model, run.given.pixels, step)
+            if run.plan.is_on("poses"):
+                centers = camera_centers(run.given.pixels.capture).to(motion.shift)
+                motion = next_motion(model, run.given.pixels, motion, centers)
+        _report(run, decisions)
+    _share_decisions(run, decisions)
+    poses.set(run.fabric.broadcast(motion))
+    apply_poses(run)
+
+
+def apply_poses(run: Training) -> None:
+    """Give all training pixels the rays of the corrected cameras."""
+    poses, given = run.model.poses, run.given
+    if poses is None:
+        return
+    run.pixels = given.pixels.posed(corrected(given.pixels.capture, poses))
+    run.quality.pixels = poses.motion.of(given.held_back)
+    if given.checked is not None:
+        run.watch.pixels = poses.motion.of(given.checked)
 
 
 def search_material(run: Training, position: StagePosition, step: int) -> None:

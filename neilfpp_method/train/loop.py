@@ -41,7 +41,14 @@ from neilfpp_method.train.checkpoint import (
     save_checkpoint,
 )
 from neilfpp_method.train.effects_record import read_plan, write_plan
-from neilfpp_method.train.evidence import apply_plan, observe_and_solve, review_before_stage, search_material
+from neilfpp_method.train.evidence import (
+    apply_plan,
+    apply_poses,
+    fit_poses,
+    observe_and_solve,
+    review_before_stage,
+    search_material,
+)
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.light_record import read_fits, write_fits
@@ -91,7 +98,7 @@ def train(run: Training) -> None:
         _save(run, optimizer, step, names=(position.stage.value, LAST))
         with timed("checks", undivided=True):
             model.eval()
-            run.preview(model, position.stage)
+            run.preview(model, run.pixels.capture, position.stage)
             model.train()
 
 
@@ -112,6 +119,7 @@ def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: Stag
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
         reached = StagePosition(stage, number, length)
+        fit_poses(run, reached, step)
         search_material(run, reached, step)
         _check_quality(run, reached, step)
         run.seconds[stage.value] = before + time.perf_counter() - started
@@ -295,6 +303,7 @@ def _restore(run: Training, optimizer: torch.optim.Optimizer) -> int:
     run.plan = read_plan(run.path, run.plan.settings, saved["step"])
     run.quality.checks += read_checks(run.path, saved["step"])
     apply_plan(run)
+    apply_poses(run)
     run.watch.findings |= {finding.case: finding for finding in read_findings(run.path) or ()}
     return saved["step"]
 

@@ -125,6 +125,7 @@ class Stream(IntEnum):
     LIGHT = 4
     MATERIAL = 5
     SEARCH = 6
+    POSES = 7
 
 
 def seed_stream(seed: int, stream: Stream, step: int = 0) -> None:

@@ -45,6 +45,7 @@ from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.json_files import read_json
 from neilfpp_method.train.lock import LOCK
 from neilfpp_method.train.output import check_folder
+from neilfpp_method.train.poses import corrected
 from neilfpp_method.train.provenance import provenance
 
 __all__ = [
@@ -123,7 +124,8 @@ class Run:
     Attributes:
         path: the run folder.
         config: all settings of the training, with the decisions on effects applied.
-        capture: the capture, with cameras in the world frame. `capture.normalization` converts to the scene
+        capture: the capture, with cameras in the world frame and the corrected poses of training views if
+            poses were corrected (`train.poses`). `capture.normalization` converts to the scene
             frame, in which all fields of the model are defined.
         facts: facts that were measured in the images before training, such as the unit of radiance and the
             kind of background.
@@ -248,6 +250,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     model = build_model(capture, described.facts, plan.config_of_model)
     load_weights(model, saved["model"], path)
     model.use(plan.config)
+    capture = corrected(capture, model.poses)
     return Run(path, plan.config, capture, described.facts, model.to(device).eval(), saved["step"])
 
 

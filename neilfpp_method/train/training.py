@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lightning_fabric import Fabric
 
+from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.health.watch import Watch
@@ -18,6 +19,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.timing.ledger import Ledger
 from neilfpp_method.train.light_record import LightFit
 from neilfpp_method.train.pace import Pace
+from neilfpp_method.train.poses import GivenCameras
 from neilfpp_method.train.progress import Reporter
 from neilfpp_method.train.quality import Quality
 
@@ -32,7 +34,7 @@ class Training:
         path: the run folder.
         config: the settings, with the current numbers of steps.
         model: the model.
-        pixels: the training pixels.
+        pixels: the training pixels, with the current poses of the cameras.
         fabric: device and processes.
         reporter: progress output.
         should_stop: whether a stop has been requested; called once per step.
@@ -48,6 +50,7 @@ class Training:
         skipped: number of steps skipped so far because they were not finite.
         skipped_in_a_row: number of steps skipped since the last one that was not.
         seconds: time of each stage.
+        given: the pixels with the poses as given.
     """
 
     path: Path
@@ -57,7 +60,7 @@ class Training:
     fabric: Fabric
     reporter: Reporter
     should_stop: Callable[[], bool]
-    preview: Callable[[NeilfModel, Stage], None]
+    preview: Callable[[NeilfModel, Capture, Stage], None]
     continue_with: str
     light_solver: LightSolver
     watch: Watch
@@ -69,3 +72,7 @@ class Training:
     skipped: int = 0
     skipped_in_a_row: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+    given: GivenCameras = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.given = GivenCameras(self.pixels, self.quality.pixels, self.watch.pixels)

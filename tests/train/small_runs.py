@@ -105,7 +105,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
         fabric=Fabric(accelerator="cpu", devices=1),
         reporter=listener,
         should_stop=lambda: False,
-        preview=lambda model, stage: None,
+        preview=lambda model, capture, stage: None,
         continue_with="",
         light_solver=model.light_solver(),
         watch=Watch(pixels.sample(64), listener.warn),
