@@ -24,6 +24,9 @@ HEADER_READERS = {
 NUMBERS_AND_TEXT = "biufU"
 """NumPy's kinds of the types that are accepted: no Python objects, which would be pickled, and no records."""
 
+NUMPYS_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Other ways of compression, such as LZMA, can ask for gigabytes to unpack a few bytes."""
+
 
 def array_of(data: bytes) -> np.ndarray:
     """Return the array of the contents of an NPY file.
@@ -35,7 +38,8 @@ def array_of(data: bytes) -> np.ndarray:
         file = io.BytesIO(data)
         shape, columns_first, kind = HEADER_READERS[np.lib.format.read_magic(file)](file)
         begin = file.tell()
-        if kind.kind not in NUMBERS_AND_TEXT:
+        # NumPy allocates one value also for an array without values.
+        if kind.kind not in NUMBERS_AND_TEXT or kind.itemsize > len(data):
             raise ValueError(f"values of the type {kind}")
         if math.prod(shape) * kind.itemsize != len(data) - begin:
             raise ValueError(f"{len(data) - begin} bytes for {kind} of the shape {shape}")
@@ -61,6 +65,8 @@ def arrays_of_archive(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as packed:
             members = packed.infolist()
+            if any(member.compress_type not in NUMPYS_COMPRESSION for member in members):
+                raise ValueError("compressed in another way than NumPy compresses")
             if sum(member.file_size for member in members) > max_bytes:
                 raise ValueError(f"more than {max_bytes} bytes")
             contents = {member.filename.removesuffix(".npy"): packed.read(member) for member in members}

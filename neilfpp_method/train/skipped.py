@@ -131,7 +131,7 @@ def load_step(run: Path, step: int) -> SkippedStep:
         raise UserError(f"{path}: a step of another version", "use the version of neilfpp that wrote it")
     try:
         return _checked(stored)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise UserError(f"{path}: not a complete step ({error})", "train again") from error
 
 
@@ -139,7 +139,7 @@ def _checked(stored: dict[str, Any]) -> SkippedStep:
     """The step of a file, whose values may be of any type.
 
     Raises:
-        TypeError, ValueError: a value has another type or shape than `keep_step` writes.
+        TypeError, ValueError, RuntimeError: a value is not one that `keep_step` writes.
     """
     batch, stage = PixelBatch(**stored["batch"]), Stage(stored["stage"])
     for field in dataclasses.fields(batch):
@@ -149,12 +149,10 @@ def _checked(stored: dict[str, Any]) -> SkippedStep:
             raise ValueError(f"{field.name} has another shape than the rays")
         if values.dtype != (torch.int64 if whole_numbers else torch.float32):
             raise ValueError(f"{field.name} has the type {values.dtype}")
-    random, now = stored["random"], torch.get_rng_state()
-    if not isinstance(random, Tensor) or (random.shape, random.dtype) != (now.shape, now.dtype):
-        raise ValueError("random is no state of the random number generator")
+    torch.Generator().set_state(stored["random"])
     if not isinstance(stored["step"], int) or not isinstance(stored["model"], dict):
         raise ValueError("the number of the step or the weights are missing")
     share = float(stored["share"])
     if not 0 <= share <= 1:
         raise ValueError(f"share is {share}")
-    return SkippedStep(stored["step"], stage, share, batch, stored["model"], random)
+    return SkippedStep(stored["step"], stage, share, batch, stored["model"], stored["random"])

@@ -54,6 +54,7 @@ HEADER = "{'descr': '%s', 'fortran_order': False, 'shape': %s}"
         with_header(HEADER % ("<f4", "(-1, -1)"), bytes(4)),
         with_header(HEADER % ("|O", "()"), b"cos\nsystem\n"),
         with_header("{'descr': '<f4', ", bytes(4)),  # raises tokenize.TokenError in NumPy
+        with_header(HEADER % ("<U500000000", "(0,)")),
         with_header("{" * 3000),
         with_header("  x\n y"),
     ],
@@ -90,3 +91,11 @@ def test_damaged_archives_are_refused_in_one_line(tmp_path):
     (tmp_path / "newer.npz").write_bytes(newer)
     with pytest.raises(ValueError, match=r"12\.7"):
         arrays_of_archive(tmp_path / "newer.npz", 2000)
+
+
+def test_other_ways_of_compression_are_refused(tmp_path):
+    """LZMA's dictionary may ask for four gigabytes."""
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_LZMA) as file:
+        file.writestr("one.npy", npy(np.arange(3)))
+    with pytest.raises(ValueError, match="another way"):
+        arrays_of_archive(tmp_path / "a.npz", 2000)
