@@ -67,6 +67,9 @@ def arrays_of_archive(path: Path, max_bytes: int) -> dict[str, np.ndarray]:
             members = packed.infolist()
             if any(member.compress_type not in NUMPYS_COMPRESSION for member in members):
                 raise ValueError("compressed in another way than NumPy compresses")
+            # zipfile reads, and allocates, as many bytes at once.
+            if any(member.compress_size > path.stat().st_size for member in members):
+                raise ValueError("a member is larger than the file")
             if sum(member.file_size for member in members) > max_bytes:
                 raise ValueError(f"more than {max_bytes} bytes")
             contents = {member.filename.removesuffix(".npy"): packed.read(member) for member in members}

@@ -99,3 +99,12 @@ def test_other_ways_of_compression_are_refused(tmp_path):
         file.writestr("one.npy", npy(np.arange(3)))
     with pytest.raises(ValueError, match="another way"):
         arrays_of_archive(tmp_path / "a.npz", 2000)
+
+
+def test_a_member_that_is_larger_than_the_file_is_refused(tmp_path):
+    """Zipfile allocates two gigabytes for it."""
+    data = bytearray(archive(tmp_path / "a.npz", one=npy(np.arange(3))).read_bytes())
+    struct.pack_into("<I", data, data.index(b"PK\1\2") + 20, 2**32 - 2)
+    (tmp_path / "a.npz").write_bytes(data)
+    with pytest.raises(ValueError, match="larger than the file"):
+        arrays_of_archive(tmp_path / "a.npz", 2000)
