@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 __all__ = ["main"]
 
 
 def main() -> int:
-    """Run the command of this process: `cli.main`, without a traceback if Ctrl-C stops its imports."""
+    """Run the command of this process, `cli.main`.
+
+    Ctrl-C and SIGTERM wait until the command handles them (`commands.ending`). After the command, while
+    Python ends, they end the process without a traceback.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows has no signal masks
+        from neilfpp_method.cli import main as run
+
+        return run()
+    signals = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    # A shell starts background jobs with Ctrl-C ignored.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         from neilfpp_method.cli import main as run
-    except KeyboardInterrupt:
-        print("stopped", file=sys.stderr)
-        return 130
-    return run()
+
+        return run()
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, signals)
 
 
 if __name__ == "__main__":

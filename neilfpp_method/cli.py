@@ -49,7 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     errors = Console(stderr=True, quiet=not first)
     with ended_by_signal() as ending:
         try:
-            _run(arguments[0], arguments[1:])
+            with ending.raised():
+                _run(arguments[0], arguments[1:])
         except EarlyEnd as end:
             if isinstance(end.__cause__, BrokenPipeError) and output_is_closed():
                 return CLOSED_OUTPUT

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
-from neilfpp_method.__main__ import main as start
 from neilfpp_method.cli import main
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.data.atomic_file import replacing
@@ -29,18 +29,75 @@ def command(monkeypatch: pytest.MonkeyPatch, run: Callable[[object], None]) -> l
     return ["inspect"]
 
 
-class Interrupted:
-    """Presses Ctrl-C when the module of the command line is imported."""
+def ended(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """The end of a process that runs a program before the command line. Ctrl-C is not ignored in it, as it is
+    in background jobs of a shell.
+    """
+    listening = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    start = "from neilfpp_method.__main__ import main; sys.exit(main())"
+    command = [sys.executable, "-c", "\n".join([listening, program, start]), *words]
+    return subprocess.run(command, capture_output=True, text=True)
 
-    def find_spec(self, name: str, *_: object) -> None:
-        if name == "neilfpp_method.cli":
-            raise KeyboardInterrupt
+
+WHILE_IMPORTED = """
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "{module}":
+            signal.raise_signal(signal.{signal})
+
+sys.meta_path.insert(0, Interrupting())
+"""
 
 
-def test_ctrl_c_while_modules_are_imported(monkeypatch, capfd):
-    monkeypatch.delitem(sys.modules, "neilfpp_method.cli")
-    monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
-    assert start() == 130
+@pytest.mark.parametrize("module", ["neilfpp_method.cli", "numpy"])
+@pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_a_signal_while_modules_are_imported(tmp_path, module, number, status):
+    program = WHILE_IMPORTED.format(module=module, signal=number)
+    done = ended(program, "inspect", str(tmp_path / "no-capture"))
+    assert (done.returncode, done.stderr) == (status, "stopped\n")
+
+
+WHILE_HANDLERS_ARE_SET = """
+import neilfpp_method.commands.ending as ending
+real, calls = signal.signal, []
+
+def set_handler(number, handler):
+    before = real(number, handler)
+    calls.append(number)
+    if len(calls) == {call}:
+        signal.raise_signal(signal.{signal})
+    return before
+
+import neilfpp_method.cli
+ending.signal.signal = set_handler
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("call", [1, 2, 3])
+def test_a_signal_while_handlers_are_set(number, call):
+    """The first call is that of the start, the others those of the command."""
+    done = ended(WHILE_HANDLERS_ARE_SET.format(call=call, signal=number), "--version")
+    assert (done.returncode, done.stderr) == ({"SIGINT": 130, "SIGTERM": 143}[number], "stopped\n")
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("call", [4, 5])
+def test_a_signal_after_the_command_prints_no_traceback(number, call):
+    done = ended(WHILE_HANDLERS_ARE_SET.format(call=call, signal=number), "--version")
+    assert done.stdout.startswith("neilfpp ")
+    assert (done.returncode, done.stderr) == (-getattr(signal, number), "")
+
+
+def test_a_second_signal_while_the_end_is_printed(monkeypatch, capfd):
+    printed = Console.print
+
+    def interrupted(console: Console, *words: object, **options: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+        printed(console, *words, **options)
+
+    monkeypatch.setattr(Console, "print", interrupted)
+    assert main(command(monkeypatch, lambda _: signal.raise_signal(signal.SIGTERM))) == 143
     assert capfd.readouterr().err == "stopped\n"
 
 

@@ -16,38 +16,64 @@ CLOSED_OUTPUT = 141
 
 
 class EndSignal:
-    """The signal that asked the process to end; `number` is 0 if there was none."""
+    """The signal that asked the process to end; `number` is 0 if there was none.
+
+    The first one counts. The signal is recorded in addition to the exception that it raises, because an
+    extension module that is being loaded may turn the exception into one of its own.
+    """
 
     def __init__(self) -> None:
         self.number = 0
+        self._raises = False
 
     @property
     def status(self) -> int:
         """The exit status that shells report for a process ended by this signal: 130 or 143."""
         return 128 + self.number
 
+    @contextmanager
+    def raised(self) -> Iterator[None]:
+        """Raise `KeyboardInterrupt` in the context on each signal, also on one that has arrived before it.
+
+        It may be raised while the context is entered or left as well, so the statement that handles it must
+        enclose the `with` statement.
+        """
+        self._raises = True
+        try:
+            if self.number:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._raises = False
+
+    def handle(self, number: int, _frame: object) -> None:
+        """The handler of the signals."""
+        self.number = self.number or number
+        if self._raises:
+            raise KeyboardInterrupt
+
 
 @contextmanager
 def ended_by_signal() -> Iterator[EndSignal]:
-    """Raise `KeyboardInterrupt` in the context on Ctrl-C and SIGTERM, so that temporary files are removed.
+    """Handle Ctrl-C and SIGTERM in the context, so that temporary files are removed.
 
-    The signal is also recorded in the yielded object, because an extension module that is being loaded may
-    turn the exception into one of its own.
+    A signal is recorded at any time, and raised only in `EndSignal.raised`: an exception while handlers are
+    installed, or while the message of the end is printed, would end the process with a traceback. Signals
+    that the start of the process has blocked are received here.
     """
-    ending = EndSignal()
-
-    def handle(number: int, _frame: object) -> None:
-        ending.number = number
-        raise KeyboardInterrupt
-
+    ending, signals = EndSignal(), (signal.SIGINT, signal.SIGTERM)
+    can_wait = hasattr(signal, "pthread_sigmask")
     previous = {}
     # Signal handlers can only be set in the main thread.
     with suppress(ValueError):
-        for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.signal(number, handle)
+        for number in signals:
+            previous[number] = signal.signal(number, ending.handle)
+    blocked = signal.pthread_sigmask(signal.SIG_UNBLOCK, signals) if can_wait and previous else None
     try:
         yield ending
     finally:
+        if blocked is not None:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for number, handler in previous.items():
             signal.signal(number, handler)
 

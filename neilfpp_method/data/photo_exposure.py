@@ -49,7 +49,7 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
 
 
 def photo_exposure(path: Path) -> float | None:
-    """Return time · ISO/100 / f-number² from EXIF, time in seconds; None if EXIF has no exposure time.
+    """Return time · ISO/100 / f-number² from EXIF, time in seconds; None if EXIF has no usable one.
 
     A missing factor counts as 1, because it is constant for a lens or a camera that does not record it. An
     ISO of 0 or an f-number of 0, which adapted lenses write, counts as missing.
@@ -63,7 +63,9 @@ def photo_exposure(path: Path) -> float | None:
     time, aperture, sensitivity = (_positive(exif.get(tag)) for tag in (TIME, APERTURE, SENSITIVITY))
     if time is None:
         return None
-    return time * (sensitivity or 100.0) / 100.0 / (aperture or 1.0) ** 2
+    # EXIF may hold numbers whose square or product has no finite value.
+    area = (aperture or 1.0) * (aperture or 1.0)
+    return _positive(time * (sensitivity or 100.0) / 100.0 / area) if area else None
 
 
 def _positive(entry: object) -> float | None:

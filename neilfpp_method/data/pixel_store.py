@@ -335,12 +335,14 @@ def _open(folder: Path, views: Sequence[View], made_from: str) -> PixelStore | N
         arrays = [
             np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("color", "bits")
         ]
-    except (OSError, ValueError, EOFError, KeyError, TypeError, RecursionError):
+    except Exception:
+        # A forged header of an array can raise any exception: NumPy evaluates it as Python source.
         return None
     store = PixelStore(tuple(views), encoding, scales, *arrays)
     shapes = [(len(store), 3), (-(-len(store) // BLOCK) * BLOCK,)]
     types = [encoding.dtype, np.dtype(np.uint8)]
-    fits = kind == [FORMAT, VERSION, made_from] and scales.shape == (len(views),) and bool((scales > 0).all())
+    scales_fit = scales.shape == (len(views),) and bool((np.isfinite(scales) & (scales > 0)).all())
+    fits = scales_fit and kind == [FORMAT, VERSION, made_from]
     if not fits or [a.shape for a in arrays] != shapes or [a.dtype for a in arrays] != types:
         return None
     return store

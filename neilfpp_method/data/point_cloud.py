@@ -139,6 +139,8 @@ def _vertices(data: bytes) -> np.ndarray:
     count = int(lines[elements[0]][2])
     if count < 0:
         raise ValueError("its header states a negative number of points")
+    if count > len(data):
+        raise ValueError(f"its header states {count} points, but it has {len(data)} bytes")
     own = lines[elements[0] : elements[1] if len(elements) > 1 else None]
     properties = [(words[2], CODES_BY_NAME[words[1]]) for words in own if words[0] == "property"]
     body = data.index(b"\n", len(head)) + 1

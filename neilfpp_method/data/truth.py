@@ -25,6 +25,7 @@ from torch import Tensor
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.mesh import Mesh, read_mesh
+from neilfpp_method.data.number_arrays import arrays_of_archive
 from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scaling import area_average, area_share, file_size, nearest
 from neilfpp_method.data.views import View
@@ -32,6 +33,9 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.structures import Material
 
 __all__ = ["LightField", "Truth"]
+
+LARGEST_LIGHT_FIELD = 2**29
+"""Largest unpacked size of a light field, in bytes: 4,096 points with 4,096 directions have 400 million."""
 
 
 @dataclass(frozen=True)
@@ -103,8 +107,8 @@ class Truth:
         if path is None:
             return None
         try:
-            with np.load(path, allow_pickle=False) as stored:
-                arrays = {name: torch.from_numpy(stored[name].astype(np.float32)) for name in stored.files}
+            stored = arrays_of_archive(path, LARGEST_LIGHT_FIELD)
+            arrays = {name: torch.from_numpy(values.astype(np.float32)) for name, values in stored.items()}
             (n, s, _), (_, k, _) = arrays["wi"].shape, arrays["wo"].shape
             shapes = {
                 "points": (n, 3),
@@ -117,8 +121,10 @@ class Truth:
             for name, shape in shapes.items():
                 if arrays[name].shape != shape:
                     raise ValueError(f"{name} has the shape {tuple(arrays[name].shape)}, not {shape}")
+                if not arrays[name].isfinite().all():
+                    raise ValueError(f"{name} has a value that is not finite")
         except Exception as error:
-            # For a damaged archive, zipfile, zlib and numpy raise many types of exceptions.
+            # Text, missing arrays and wrong numbers of axes raise different types of exceptions.
             raise UserError(
                 f"{path}: not a light field ({error})", "remove the file, or write it again"
             ) from error

@@ -8,7 +8,6 @@ Extraction at a resolution of 512 takes about ten seconds on a CPU, and the shad
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from neilfpp_method import __version__
 from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.number_arrays import arrays_of_archive
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.extract import extract_mesh
 from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
@@ -206,19 +206,10 @@ def _checked(path: Path, made_from: str) -> ExtractedSurface | None:
         Exception: the file is damaged.
     """
     # Nothing is compressed, so that no array is larger than the file.
-    with zipfile.ZipFile(path) as packed:
-        for member in packed.infolist():
-            if member.compress_type != zipfile.ZIP_STORED:
-                raise ValueError(f"{member.filename} is compressed")
-            with packed.open(member) as file:
-                np.lib.format.read_magic(file)
-                shape, _, kind = np.lib.format.read_array_header_1_0(file)
-            if kind.hasobject or np.prod(shape, dtype=object) * kind.itemsize > path.stat().st_size:
-                raise ValueError(f"{member.filename} does not fit into the file")
-    with np.load(path, allow_pickle=False) as stored:
-        if str(stored["made_from"]) != made_from:
-            return None
-        vertices, faces, normals = (stored[name] for name in ("vertices", "faces", "normals"))
+    stored = arrays_of_archive(path, path.stat().st_size)
+    if str(stored["made_from"]) != made_from:
+        return None
+    vertices, faces, normals = (stored[name] for name in ("vertices", "faces", "normals"))
     for values, kind in ((vertices, np.float32), (faces, np.int32), (normals, np.float32)):
         if values.dtype != kind or values.ndim != 2 or values.shape[1] != 3 or not np.isfinite(values).all():
             raise ValueError(f"an array of {values.dtype} with the shape {values.shape}")

@@ -20,6 +20,11 @@ MIN_SHARE = 0.6
 SEED = 7
 """Seed of COLMAP's random numbers (RANSAC), so that a repeated command gives the same poses."""
 
+MAX_REPEATABLE = 200
+"""Largest number of images that are placed by one thread, so that a repeated command gives the same poses,
+bit for bit. With more images, whose common adjustment takes long, all processors are used.
+"""
+
 SHOOTING_ADVICE = (
     "take more photographs between the existing ones, at most 15° apart, with textured surfaces in view"
 )
@@ -104,6 +109,8 @@ def refuse_partial(missing: Sequence[str], sizes: Sequence[int]) -> None:
 
 def _options(count: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
+    # Sums of several threads depend on their number and order, and the poses on the sums.
+    options.num_threads = 1 if count <= MAX_REPEATABLE else -1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.min_model_size = min(options.min_model_size, max(3, count // 3))
     return options

@@ -33,6 +33,9 @@ __all__ = [
 Pairing = Literal["exhaustive", "sequential", "vocabulary"]
 """Which pairs of images are matched: all, neighbours in the order of the names, or similar images."""
 
+SEED = 7
+"""Seed of the random numbers that verify a pair (RANSAC)."""
+
 MAX_EXHAUSTIVE = 200
 """Largest number of images of which all pairs are matched (19 900 pairs); the time grows with its square."""
 
@@ -142,7 +145,11 @@ def match_features(
     expected = min(images * partners, pairs)
 
     def match(token: pycolmap.CancellationToken) -> None:
-        common = {"device": pycolmap.Device.cpu, "cancellation_token": token}
+        common = {
+            "verification_options": _verification(),
+            "device": pycolmap.Device.cpu,
+            "cancellation_token": token,
+        }
         if pairing == "exhaustive":
             pycolmap.match_exhaustive(database, **common)
         elif pairing == "sequential":
@@ -233,6 +240,17 @@ def _initial_camera(copies: Path, photo: Photo, model: str) -> pycolmap.Camera:
     camera = pycolmap.Camera.create_from_model_name(0, model, focal, width, height)
     camera.has_prior_focal_length = photo.focal is not None
     return camera
+
+
+def _verification() -> pycolmap.TwoViewGeometryOptions:
+    """Options that verify each pair with random numbers of its own.
+
+    Otherwise each of COLMAP's threads draws one sequence for all of its pairs. The inliers of a pair then
+    depend on which pairs its thread has verified before, and so on whether the command was interrupted.
+    """
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = SEED
+    return options
 
 
 def _sequential() -> pycolmap.SequentialPairingOptions:

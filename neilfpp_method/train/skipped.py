@@ -130,7 +130,29 @@ def load_step(run: Path, step: int) -> SkippedStep:
     if not isinstance(stored, dict) or stored.get("format") != FORMAT or KEYS - set(stored):
         raise UserError(f"{path}: a step of another version", "use the version of neilfpp that wrote it")
     try:
-        batch, stage = PixelBatch(**stored["batch"]), Stage(stored["stage"])
-    except (TypeError, ValueError) as error:
+        return _checked(stored)
+    except (TypeError, ValueError, RuntimeError) as error:
         raise UserError(f"{path}: not a complete step ({error})", "train again") from error
-    return SkippedStep(stored["step"], stage, stored["share"], batch, stored["model"], stored["random"])
+
+
+def _checked(stored: dict[str, Any]) -> SkippedStep:
+    """The step of a file, whose values may be of any type.
+
+    Raises:
+        TypeError, ValueError, RuntimeError: a value is not one that `keep_step` writes.
+    """
+    batch, stage = PixelBatch(**stored["batch"]), Stage(stored["stage"])
+    for field in dataclasses.fields(batch):
+        values, whole_numbers = getattr(batch, field.name), field.name == "view"
+        width = (3,) if field.name in ("origins", "directions", "color") else ()
+        if not isinstance(values, Tensor) or values.shape != (len(batch.view), *width):
+            raise ValueError(f"{field.name} has another shape than the rays")
+        if values.dtype != (torch.int64 if whole_numbers else torch.float32):
+            raise ValueError(f"{field.name} has the type {values.dtype}")
+    torch.Generator().set_state(stored["random"])
+    if not isinstance(stored["step"], int) or not isinstance(stored["model"], dict):
+        raise ValueError("the number of the step or the weights are missing")
+    share = float(stored["share"])
+    if not 0 <= share <= 1:
+        raise ValueError(f"share is {share}")
+    return SkippedStep(stored["step"], stage, share, batch, stored["model"], stored["random"])

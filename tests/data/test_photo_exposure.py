@@ -30,6 +30,15 @@ def test_exposure_from_exif(tmp_path: Path) -> None:
         exposures_of(tmp_path, [tmp_path / "c.png"])
 
 
+@pytest.mark.parametrize(("time", "aperture"), [(1e300, 1e-50), (1e-300, 1e50), (1.0, 1e200), (1.0, 1e-200)])
+def test_numbers_of_exif_without_a_finite_product(tmp_path: Path, monkeypatch, time, aperture) -> None:
+    """EXIF may hold numbers of double precision, which Pillow does not write."""
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "a.jpg")
+    entries = {0x829A: time, 0x829D: aperture}
+    monkeypatch.setattr(Image.Exif, "get_ifd", lambda *_: entries)
+    assert photo_exposure(tmp_path / "a.jpg") is None
+
+
 def test_exposures_from_a_file(tmp_path: Path) -> None:
     (tmp_path / "exposures.txt").write_text("# seconds\na.jpg 1/60\nsub/a b.jpg  2.5  # long\n\n")
     images = [tmp_path / "a.jpg", tmp_path / "sub" / "a b.jpg"]

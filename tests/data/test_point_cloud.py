@@ -14,6 +14,7 @@ from neilfpp_method.data.point_cloud import (
     WorldPoints,
     load_point_cloud,
     read_oriented_ply,
+    read_positions,
     write_oriented_ply,
 )
 from neilfpp_method.errors import UserError
@@ -106,3 +107,12 @@ def test_numbers_that_are_not_finite(tmp_path: Path, bad: float) -> None:
     for name in ("a", "b", "c"):
         with pytest.raises(UserError, match=rf"{name}\.ply: 1 of 2 points"):
             read_oriented_ply(tmp_path / f"{name}.ply")
+
+
+def test_more_points_than_a_file_can_have(tmp_path: Path) -> None:
+    """NumPy takes no number beyond 64 bits, and no file has so many bytes."""
+    path = tmp_path / "a.ply"
+    for kind in ("ascii", "binary_little_endian"):
+        path.write_text(f"ply\nformat {kind} 1.0\nelement vertex {9**30}\nproperty float x\nend_header\n1\n")
+        with pytest.raises(UserError, match="states 42391158275216203514294433201 points"):
+            read_positions(path)

@@ -20,6 +20,7 @@ from neilfpp_method.train.rerun import rerun_step, rerun_summary
 from neilfpp_method.train.run import CaptureSource, create_run
 from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
 from neilfpp_method.train.training import Training
+from tests.hard_cases.hostile.stored_readers import make_step
 from tests.train.small_runs import small_config, small_training
 
 
@@ -164,3 +165,34 @@ def test_a_step_that_is_not_stored(training, monkeypatch, capfd):
     (training.path / FOLDER / "3.pt").write_bytes(b"not a step")
     assert main(["replay", str(training.path), "3"]) == 2
     assert capfd.readouterr().err.count("\n") == 2
+
+
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        ("random", torch.zeros(8, dtype=torch.uint8)),
+        ("random", torch.full_like(torch.get_rng_state(), 255)),
+        ("random", None),
+        ("step", "7"),
+        ("share", math.nan),
+        ("share", "half"),
+        ("stage", "none"),
+        ("batch", {}),
+        ("model", None),
+    ],
+)
+def test_a_stored_step_with_other_values_is_refused(tmp_path, part, value):
+    (path,) = make_step(tmp_path)
+    assert load_step(tmp_path, 7).step == 7
+    torch.save(torch.load(path) | {part: value}, path)
+    with pytest.raises(UserError, match=r"not a complete step .*; train again"):
+        load_step(tmp_path, 7)
+
+
+def test_a_stored_batch_of_another_shape_is_refused(tmp_path):
+    (path,) = make_step(tmp_path)
+    stored = torch.load(path)
+    for name, value in {"mask": torch.ones(3), "color": torch.ones(4, 2), "view": torch.ones(4)}.items():
+        torch.save(stored | {"batch": stored["batch"] | {name: value}}, path)
+        with pytest.raises(UserError, match="not a complete step"):
+            load_step(tmp_path, 7)

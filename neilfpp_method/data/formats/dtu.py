@@ -11,7 +11,6 @@ principal points.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from scipy.linalg import rq
 
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
+from neilfpp_method.data.number_arrays import arrays_of_archive
 from neilfpp_method.data.paths import inside
 from neilfpp_method.data.views import CaptureFiles, Normalization, View
 from neilfpp_method.errors import UserError
@@ -49,7 +49,12 @@ def read(root: Path) -> CaptureFiles:
         UserError: the archive is malformed, or images, masks and cameras do not match.
     """
     archive = inside(root, next(root / name for name in CAMERAS if (root / name).is_file()))
-    matrices = _matrices(archive)
+    try:
+        matrices = arrays_of_archive(archive, MAX_BYTES)
+    except ValueError as error:
+        raise UserError(
+            f"{archive}: not an archive of matrices ({error})", "export the cameras again"
+        ) from error
     images = _files(root, next(root / name for name in IMAGES if (root / name).is_dir()))
     masks = next((_files(root, root / name) for name in MASKS if (root / name).is_dir()), ())
     cameras = sum(name.startswith("world_mat_") and "inv" not in name for name in matrices)
@@ -66,20 +71,6 @@ def read(root: Path) -> CaptureFiles:
         )
         views.append(View(image.stem, i, camera, image, masks[i] if masks else None))
     return CaptureFiles(root, tuple(views), _normalization(matrices, len(images), archive))
-
-
-def _matrices(archive: Path) -> Mapping[str, np.ndarray]:
-    """The arrays of an archive whose unpacked size is bounded; pickled ones are refused."""
-    try:
-        with zipfile.ZipFile(archive) as packed:
-            if sum(member.file_size for member in packed.infolist()) > MAX_BYTES:
-                raise ValueError("it is too large for matrices of cameras")
-        with np.load(archive, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile, MemoryError) as error:
-        raise UserError(
-            f"{archive}: not an archive of matrices ({error})", "export the cameras again"
-        ) from error
 
 
 def _matrix(matrices: Mapping[str, np.ndarray], name: str, archive: Path) -> Float64[np.ndarray, "4 4"]:

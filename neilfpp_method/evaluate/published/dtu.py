@@ -24,7 +24,7 @@ millimetres if the capture is in the frame of the dataset, which the reader `dtu
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,11 +32,11 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float, Integer
-from scipy.io import loadmat, whosmat
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published.dtu_surface import capped_mean, surface_samples, thinned
+from neilfpp_method.evaluate.published.mat_file import read_matrices
 from neilfpp_method.evaluate.published.protocol import Protocol
 from neilfpp_method.evaluate.published.truth_files import existing
 from neilfpp_method.evaluate.views import RenderedView
@@ -56,8 +56,6 @@ PATCH = 60.0
 """Margin around the box of the observed cells, mm (official code)."""
 SEED = 0
 """Seed of the order in which points are removed."""
-LARGEST_MASK = 2**30
-"""Largest accepted number of cells of an observation mask; the dataset's masks have up to 30 million."""
 LARGEST_CLOUD = 2**31
 """Largest accepted size of the file of true points, bytes."""
 
@@ -132,8 +130,8 @@ def read_scan(capture: Capture) -> ScanData:
         UserError: a file is missing, damaged, or too large.
     """
     files = _files(capture)
-    mask = _matrices(files.mask, {"ObsMask": 3, "BB": 2, "Res": 2})
-    plane = _matrices(files.plane, {"P": 2})["P"].reshape(-1).astype(np.float64)
+    mask = read_matrices(files.mask, {"ObsMask": 3, "BB": 2, "Res": 2})
+    plane = read_matrices(files.plane, {"P": 2})["P"].reshape(-1).astype(np.float64)
     box, cell = mask["BB"].astype(np.float64), mask["Res"].reshape(-1).astype(np.float64)
     shapes_fit = box.shape == (2, 3) and cell.shape == (1,) and plane.shape == (4,)
     if not shapes_fit or not np.isfinite([*box.flat, *cell, *plane]).all() or cell[0] <= 0:
@@ -182,24 +180,6 @@ def _file(capture: Capture, name: str) -> Path:
             "put ObsMask and Points of the dataset's SampleSet there",
         )
     return path
-
-
-def _matrices(path: Path, wanted: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """Read arrays of numbers from a Matlab file; `wanted` maps names to numbers of axes.
-
-    Shapes are checked before any array is loaded.
-    """
-    try:
-        shapes = {name: (shape, kind) for name, shape, kind in whosmat(str(path))}
-        for name, axes in wanted.items():
-            shape, kind = shapes[name]
-            too_large = np.prod(shape, dtype=float) > LARGEST_MASK
-            if len(shape) != axes or too_large or kind in ("cell", "struct", "object"):
-                raise ValueError(f"{name} is {kind} of shape {shape}")
-        return {name: np.asarray(loadmat(str(path), variable_names=[name])[name]) for name in wanted}
-    # A damaged or forged file can raise any exception in the reader.
-    except Exception as error:
-        raise UserError(f"{path}: cannot be read ({error})", "download the SampleSet again") from error
 
 
 def _points(path: Path) -> Float[np.ndarray, "P 3"]:

@@ -48,8 +48,9 @@ def test_a_few_kills_of_trainings(tmp_path: Path) -> None:
 
 @pytest.mark.hard
 def test_a_sigterm_while_a_command_starts_prints_no_traceback(tmp_path: Path, record_property) -> None:
+    """`tests/test_ending.py` sends signals at chosen moments."""
     root, draw = make_capture(tmp_path / "capture"), random.Random(0)
-    command = [sys.executable, "-m", "neilfpp_method.cli", "inspect", str(root)]
+    command = [sys.executable, "-m", "neilfpp_method", "inspect", str(root)]
     began = time.monotonic()
     whole = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
     took = time.monotonic() - began

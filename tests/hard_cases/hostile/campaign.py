@@ -2,10 +2,11 @@
 
     python -m tests.hard_cases.hostile.campaign 10000                    print the table
     python -m tests.hard_cases.hostile.campaign 10000 --keep FOLDER      continue a campaign that was stopped
+    python -m tests.hard_cases.hostile.campaign 10000 --keep FOLDER --readers EXR PNG
     python -m tests.hard_cases.hostile.campaign 0 --keep FOLDER --write  write the table into the document
 
-The number is that of the inputs of a cheap reader; readers whose inputs cost milliseconds get a fifth of it.
-All readers take turns, a chunk of inputs each, so a campaign that is stopped early has tried them evenly.
+Readers take turns, a chunk of inputs each, so a campaign that is stopped early has tried them evenly.
+Several campaigns with different readers may use one folder at a time.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from tests.hard_cases.hostile.worker import Outcome, attack
 
 DOCUMENT = Path(__file__).parents[3] / "docs" / "stability.md"
 MARKED = re.compile(r"(<!-- hostile -->\n).*?(<!-- end -->)", re.DOTALL)
-CHUNK = 500
-"""Inputs of a cheap reader between two saves."""
+CHUNK = 250
+"""Inputs of a reader between two saves."""
 
 
 @dataclass
@@ -37,17 +38,21 @@ class Progress:
     done: dict[str, int] = field(default_factory=dict)
 
     @staticmethod
-    def read(path: Path) -> Progress:
-        """The progress that `write` saved; an empty one if there is no such file."""
-        if not path.exists():
-            return Progress()
-        saved = json.loads(path.read_text())
-        return Progress({name: Outcome(**o) for name, o in saved["outcomes"].items()}, saved["done"])
+    def read(folder: Path) -> Progress:
+        """The progress that `write` saved, of all readers."""
+        progress = Progress()
+        for number, name in enumerate(READERS):
+            if (path := folder / f"{number}.json").exists():
+                saved = json.loads(path.read_text())
+                progress.outcomes[name], progress.done[name] = Outcome(**saved["outcome"]), saved["done"]
+        return progress
 
-    def write(self, path: Path) -> None:
+    def write(self, folder: Path, name: str) -> None:
+        """Save the progress of a reader in a file of its own."""
+        path = folder / f"{list(READERS).index(name)}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.with_suffix(".new")
-        temporary.write_text(json.dumps(asdict(self), indent=1))
+        temporary.write_text(json.dumps({"outcome": asdict(self.outcomes[name]), "done": self.done[name]}))
         temporary.replace(path)
 
     def add(self, name: str, count: int, outcome: Outcome) -> None:
@@ -75,26 +80,32 @@ def table(progress: Progress) -> str:
     return "\n".join(rows) + f"\n\n{total:,} inputs, {faults} faults.\n"
 
 
-def main(count: tyro.conf.Positional[int], keep: Path | None = None, write: bool = False) -> int:
+def main(
+    count: tyro.conf.Positional[int],
+    keep: Path | None = None,
+    readers: tuple[str, ...] = tuple(READERS),
+    write: bool = False,
+) -> int:
     """Read damaged files with every reader; exit status 1 if there is a fault.
 
     Args:
-        count: inputs of a cheap reader, numbered from 0; the same numbers are the same damage.
+        count: inputs of a reader, numbered from 0; the same numbers are the same damage.
         keep: folder in which the progress is saved, and from which a stopped campaign continues.
+        readers: names of the readers.
         write: put the table into docs/stability.md.
     """
     warnings.simplefilter("ignore")
-    record = keep / "progress.json" if keep else None
-    progress = Progress.read(record) if record else Progress()
+    progress = Progress.read(keep) if keep else Progress()
     for turn in range(CHUNK, count + CHUNK, CHUNK):
-        for name, reader in READERS.items():
-            begin, end = progress.done.get(name, 0), max(1, round(min(turn, count) * reader.share))
+        for name in readers:
+            begin, end = progress.done.get(name, 0), min(turn, count)
             if begin >= end:
                 continue
             with tempfile.TemporaryDirectory() as folder:
-                progress.add(name, end - begin, attack(reader, Path(folder) / "files", begin, end - begin))
-            if record:
-                progress.write(record)
+                outcome = attack(READERS[name], Path(folder) / "files", begin, end - begin)
+            progress.add(name, end - begin, outcome)
+            if keep:
+                progress.write(keep, name)
     print(table(progress))
     for name, outcome in progress.outcomes.items():
         for number, file, what in outcome.faults:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tests.hard_cases.hostile.containers import damage_inside
+
 __all__ = ["mutated"]
 
 Draw = np.random.Generator
@@ -25,12 +27,20 @@ WORDS = [
 
 
 def mutated(data: bytes, number: int) -> bytes:
-    """Return the damaged contents of a file: one to three of the kinds of damage below."""
+    """Return the damaged contents of a file: one to three of the kinds of damage below.
+
+    Half of the damage to a container is done inside of it, with checksums and lengths made valid again.
+    """
     draw = np.random.default_rng([number, len(data)])
-    kinds = DAMAGES + (TEXT_DAMAGES if _is_text(data) else ())
     for _ in range(int(draw.choice([1, 1, 2, 3]))):
-        data = kinds[draw.integers(len(kinds))](data, draw)
+        inside = damage_inside(data, draw, _damaged) if draw.random() < 0.5 else None
+        data = _damaged(data, draw) if inside is None else inside
     return data
+
+
+def _damaged(data: bytes, draw: Draw) -> bytes:
+    kinds = DAMAGES + (TEXT_DAMAGES if _is_text(data) else ())
+    return kinds[draw.integers(len(kinds))](data, draw)
 
 
 def _is_text(data: bytes) -> bool:

@@ -7,6 +7,7 @@ import json
 import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ import yaml
 from PIL import Image
 
 from neilfpp_method.data.bracket_folder import find_brackets
-from neilfpp_method.data.capture import load_capture
+from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.environment_map import read_environment
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
 from neilfpp_method.data.images import image_header, read_image, write_exr, write_png
@@ -43,6 +44,16 @@ from neilfpp_method.train.work_record import read_work
 from tests.data.formats import test_blender, test_colmap, test_dtu, test_nerfactor, test_nero, test_transforms
 from tests.data.make_capture import make_capture
 from tests.data.test_capture_folder import folder as own_capture
+from tests.hard_cases.hostile.stored_readers import (
+    make_numbers,
+    make_pixels,
+    make_scan,
+    make_step,
+    read_numbers,
+    read_pixels,
+    read_scanned,
+    read_step,
+)
 
 __all__ = ["READERS", "Reader"]
 
@@ -275,10 +286,18 @@ def _truth(folder: Path) -> list[Path]:
     return [path]
 
 
+@cache
+def _capture(folder: Path) -> Capture:
+    """A capture beside the damaged file."""
+    return load_capture(folder)
+
+
 def _read_truth(folder: Path, damaged: Path) -> None:
-    field = Truth(load_capture(folder)).light_field()
+    field = Truth(_capture(folder)).light_field()
     assert field is not None
     assert field.position.shape == (len(field.position), 3)
+    assert field.position.isfinite().all()
+    assert field.incident.isfinite().all()
 
 
 def _groups(folder: Path) -> list[Path]:
@@ -465,10 +484,14 @@ READERS: Mapping[str, Reader] = {
     "COLMAP, text": Reader(_colmap(text=True), _read_capture, 0.2),
     "NPZ of cameras (DTU)": Reader(_json_capture(test_dtu.scan, "cameras_sphere.npz"), _read_capture, 0.2),
     "NPZ of a light field": Reader(_truth, _read_truth),
+    "NPY of a protocol's truth": Reader(make_numbers, read_numbers),
+    "scan of DTU (MAT, PLY)": Reader(make_scan, read_scanned, 0.2),
     "pickle (NeRO)": Reader(_nero, _read_nero),
     "brackets and exposures": Reader(_groups, _read_groups),
     "settings (YAML, JSON)": Reader(_yaml, _read_yaml),
     "checkpoint": Reader(_checkpoint, _read_checkpoint),
     "run folder (JSON)": Reader(_run, _read_run),
     "surface in a run folder (NPZ)": Reader(_surface, _read_surface),
+    "pixels in a run folder (NPY, JSON)": Reader(make_pixels, read_pixels, 0.2),
+    "skipped step": Reader(make_step, read_step),
 }

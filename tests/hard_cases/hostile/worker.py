@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from neilfpp_method.errors import UserError
+from tests.hard_cases.hostile.forbidden import watch
 from tests.hard_cases.hostile.mutations import mutated
 from tests.hard_cases.hostile.readers import READERS, Reader
 
@@ -71,7 +72,12 @@ def attack(reader: Reader, folder: Path, first: int, count: int) -> Outcome:
         at.write_bytes(number.to_bytes(8, "little"))
         child = os.fork()
         if not child:
-            _read_all(reader, capture, whole, range(number, last), told, at)
+            try:
+                _read_all(reader, capture, whole, range(number, last), told, at)
+            except BaseException:
+                traceback.print_exc()  # a fault of this program
+            finally:
+                os._exit(1)
         _, status = os.waitpid(child, 0)
         if told.exists():
             part = Outcome(**json.loads(told.read_text()))
@@ -84,7 +90,7 @@ def attack(reader: Reader, folder: Path, first: int, count: int) -> Outcome:
             died = signal.Signals(status & 127).name if status & 127 else f"status {status >> 8}"
             outcome.faults.append((number, paths[number % len(paths)].name, died))
             for path, content in whole.items():
-                path.write_bytes(content)
+                _replace(path, content)
         number += 1
     return outcome
 
@@ -96,12 +102,13 @@ def _read_all(
     held, paths, outcome = _address_space(), list(whole), Outcome()
     resource.setrlimit(resource.RLIMIT_AS, (held + ROOM, held + ROOM))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    before = _peak()
+    before, forbidden = _peak(), watch(capture)
     with at.open("r+b", buffering=0) as place:
         for number in numbers:
             os.pwrite(place.fileno(), number.to_bytes(8, "little"), 0)
             path = paths[number % len(paths)]
-            path.write_bytes(mutated(whole[path], number))
+            _replace(path, mutated(whole[path], number))
+            forbidden()
             before_it = len(outcome.faults)
             began = time.process_time()
             # Either signal ends the process.
@@ -118,9 +125,10 @@ def _read_all(
                 outcome.faults.append((number, path.name, traceback.format_exc(limit=-4)))
             signal.alarm(0)
             signal.setitimer(signal.ITIMER_PROF, 0.0)
+            outcome.faults += [(number, path.name, what) for what in forbidden()]
             if time.process_time() - began > LONGEST:
                 outcome.faults.append((number, path.name, f"{time.process_time() - began:.1f} seconds"))
-            path.write_bytes(whole[path])
+            _replace(path, whole[path])
             outcome.grown = _peak() - before
             whole_hundred = number % 100 == 99 or number + 1 == numbers.stop
             if whole_hundred or len(outcome.faults) > before_it:
@@ -129,6 +137,12 @@ def _read_all(
             outcome.faults.append((numbers.start, "", f"memory grew by {outcome.grown >> 20} MiB"))
             _write(told, outcome)
     os._exit(0)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a new file. One that was cut to no length and written again would be sent to the disk at once."""
+    path.unlink()
+    path.write_bytes(content)
 
 
 def _write(told: Path, outcome: Outcome) -> None:
