@@ -31,8 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the words of the command line; None for those of the process.
 
     Returns:
-        The exit status: 0 for success, 2 for bad input, 130 after Ctrl-C and for a stopped command that can be
-        continued, 141 if standard output was closed, 143 after SIGTERM, 1 otherwise.
+        The exit status: 0 for success, 2 for bad input, 130 after Ctrl-C and for a stopped command that can
+        be continued, 141 if standard output was closed, 143 after SIGTERM, 1 otherwise.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

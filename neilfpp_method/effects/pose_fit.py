@@ -105,7 +105,7 @@ def _solve(
 
 def _render(model: NeilfModel, batch: PixelBatch, pixel: Float[Tensor, " V"]) -> _Rendered:
     """Render the cones of pixels."""
-    directions, radius = batch.directions, pixel[batch.view, None, None]
+    directions, radius = batch.directions, pixel[batch.view, None, None].to(batch.directions)
     turn = torch.arange(CONE_RAYS).to(directions) * (2 * math.pi / CONE_RAYS)
     circle = torch.stack((turn.cos(), turn.sin()), -1)
     aside = torch.einsum("kj,nji->nki", circle, local_frame(directions)[:, :2])

@@ -77,7 +77,8 @@ def next_motion(
 
 def pixel_angles(pixels: PixelDataset) -> Float[Tensor, " V"]:
     """Angle that a pixel of each view covers, radians."""
-    angles = [1 / max(view.camera.fx, view.camera.fy) for view in pixels.views]
+    # Focal lengths may be NumPy's numbers, of which torch would make a tensor in double precision.
+    angles = [1 / float(max(view.camera.fx, view.camera.fy)) for view in pixels.views]
     return torch.tensor(angles, device=pixels.device)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.pose_fit import _render, fit_poses
+from neilfpp_method.effects.poses import pixel_angles
 from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.effects.review import review_poses
 from neilfpp_method.errors import UserError
@@ -160,6 +163,25 @@ def test_a_known_scene_gives_the_poses(response):
         motion = fit_poses(model_of(Slope(), response), given, motion, torch.full((VIEWS,), 0.004))
     left = PoseMotion(noise.rotation + motion.rotation, noise.shift + motion.shift)
     assert rms(displacement(left, centers)) < 0.25 * rms(displacement(noise, centers))
+
+
+def test_rays_keep_their_precision_whatever_numbers_the_focal_lengths_are(ball):
+    """A capture in Blender's layout has focal lengths of NumPy's float64."""
+    views = [
+        replace(v, camera=replace(v.camera, fx=np.float64(v.camera.fx), fy=np.float64(v.camera.fy)))
+        for v in ball.train_views
+    ]
+    pixels = PixelDataset(ball, views)
+    assert pixel_angles(pixels).dtype == torch.float32
+    batch, given = pixels.numbered(pixels.draw(20)), []
+
+    class Checked(Ball):
+        def render(self, rays: RayBatch) -> SurfaceHits:
+            given.append(rays.directions.dtype)
+            return super().render(rays)
+
+    _render(model_of(Checked()), batch, pixel_angles(pixels).double())
+    assert set(given) == {torch.float32}
 
 
 def test_a_view_without_pixels_keeps_its_pose(ball):
