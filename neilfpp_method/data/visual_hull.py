@@ -106,7 +106,8 @@ def find_hull(
     faces[1:-1, 1:-1, 1:-1] = False
     if hull[faces].any():
         return "the masks show something that extends beyond the scene box"
-    return DistanceCube(torch.from_numpy(signed_distance(hull, 2 * radius / resolution)), radius)
+    distance = signed_distance(hull, 2 * radius / resolution, keeps_thin_parts=True)
+    return DistanceCube(torch.from_numpy(distance), radius)
 
 
 def visual_hull(outlines: Sequence[Outline], radius: float, resolution: int) -> Bool[np.ndarray, "R R R"]:
@@ -170,7 +171,9 @@ def cell_centers(radius: float, resolution: int) -> Float64[np.ndarray, "P 3"]:
     return np.stack(np.meshgrid(center, center, center, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def signed_distance(inside: Bool[np.ndarray, "R R R"], cell: float) -> Float32[np.ndarray, "R R R"]:
+def signed_distance(
+    inside: Bool[np.ndarray, "R R R"], cell: float, keeps_thin_parts: bool = False
+) -> Float32[np.ndarray, "R R R"]:
     """Return the smoothed Euclidean distance of cell centres from the surface, negative inside.
 
     The surface lies half a cell from the centres next to it.
@@ -178,8 +181,11 @@ def signed_distance(inside: Bool[np.ndarray, "R R R"], cell: float) -> Float32[n
     Args:
         inside: which cells are inside; at least one cell must be inside and one outside.
         cell: width of a cell, in the unit of the result.
+        keeps_thin_parts: whether parts that are a few cells thin remain; the blur removes them otherwise.
     """
     within, without = ndimage.distance_transform_edt(inside), ndimage.distance_transform_edt(~inside)
     exact = np.where(inside, 0.5 - within, without - 0.5).astype(np.float32)
     blurred = ndimage.gaussian_filter(exact, SMOOTHING, mode="nearest")
-    return cell * np.where(np.abs(blurred - exact) > MAX_CHANGE, exact, blurred)
+    if keeps_thin_parts:
+        blurred = np.where(np.abs(blurred - exact) > MAX_CHANGE, exact, blurred)
+    return cell * blurred
