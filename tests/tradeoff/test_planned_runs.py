@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from neilfpp_method.cli import main
 from neilfpp_method.data.images import write_exr
 from neilfpp_method.errors import UserError
+from neilfpp_method.relight.request import RelightRequest
 from neilfpp_method.settings import presets
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.tradeoff import planned_runs, relighting
@@ -121,7 +123,7 @@ def test_a_budget_that_an_earlier_run_has_shown_to_be_too_small_is_not_tried(wor
 
 
 def test_relit_views_are_compared_without_another_training(tmp_path, words, clock, monkeypatch, capsys):
-    monkeypatch.setattr(relighting, "RESOLUTION", 32)
+    monkeypatch.setattr(relighting, "RelightRequest", partial(RelightRequest, resolution=32))
     out, words = tmp_path / "out", [*words, "--budgets", "2m,3m"]
     assert main(words) == 0
     checkpoints = {name: files(out / name / "checkpoints") for name in ("2m-seed0", "3m-seed0")}
