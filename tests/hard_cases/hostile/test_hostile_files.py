@@ -135,7 +135,8 @@ def read(folder, path):
 outcome = worker.attack(Reader(make, read), Path(sys.argv[1]) / "x", 10, 6)
 print(json.dumps([[fault[0], fault[2]] for fault in outcome.faults]))
 """
-    faults = faults_of(program, tmp_path)
+    # This reader looks up the number of its input outside of the folder, which is reported, too.
+    faults = [fault for fault in faults_of(program, tmp_path) if not fault[1].startswith("open ")]
     assert [number for number, _ in faults] == [11, 13, 14], faults
     for (_, what), word in zip(faults, ("SIGPROF", "seconds", "SIGALRM"), strict=True):
         assert word in what
