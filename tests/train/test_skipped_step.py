@@ -184,14 +184,14 @@ def test_a_step_that_is_not_stored(training, monkeypatch, capfd):
 def test_a_stored_step_with_other_values_is_refused(tmp_path, part, value):
     (path,) = make_step(tmp_path)
     assert load_step(tmp_path, 7).step == 7
-    torch.save(torch.load(path) | {part: value}, path)
+    torch.save(torch.load(path, weights_only=True) | {part: value}, path)
     with pytest.raises(UserError, match=r"not a complete step .*; train again"):
         load_step(tmp_path, 7)
 
 
 def test_a_stored_batch_of_another_shape_is_refused(tmp_path):
     (path,) = make_step(tmp_path)
-    stored = torch.load(path)
+    stored = torch.load(path, weights_only=True)
     for name, value in {"mask": torch.ones(3), "color": torch.ones(4, 2), "view": torch.ones(4)}.items():
         torch.save(stored | {"batch": stored["batch"] | {name: value}}, path)
         with pytest.raises(UserError, match="not a complete step"):
