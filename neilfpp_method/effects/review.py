@@ -34,6 +34,7 @@ __all__ = [
     "MAX_PIXELS",
     "MIN_PIXELS",
     "MIN_TRAIN_VIEWS",
+    "POSE_STEPS",
     "SURFACE_PIXELS",
     "LightReview",
     "improve_material",
@@ -61,6 +62,10 @@ PLACES = 1200
 """Maximum number of places for the initial light."""
 VIEWS = 20
 """Maximum number of views per place. 10,000 pixels take 200 MB."""
+POSE_STEPS = 200
+"""Minimum number of steps after which poses are judged. After 24 steps of the short demo, corrections of
+exact poses reduced the error of R by 1.5 to 3 %, almost as much as those of inaccurate poses do later.
+"""
 MIN_VIEWS = 4
 """Minimum number of views per place: fewer do not distinguish materials."""
 AT_ONCE = 512
@@ -220,7 +225,12 @@ def review_poses(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int)
     """
     if not plan.is_open("poses") or plan.newest("poses") is not None:
         return []
-    decision = plan.decide("poses", pose_evidence(model, pixels), step)
+    if step < POSE_STEPS:
+        reason = f"not measured: R is blurred after fewer than {POSE_STEPS} steps"
+        decision = Decision(step, "poses", False, "evidence", reason)
+        plan.decisions.append(decision)
+    else:
+        decision = plan.decide("poses", pose_evidence(model, pixels), step)
     model.use(plan.config)
     return [decision]
 

@@ -16,7 +16,7 @@ from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.pose_fit import _render, fit_poses
 from neilfpp_method.effects.poses import pixel_angles
 from neilfpp_method.effects.request import check_effects, parse_effects
-from neilfpp_method.effects.review import review_poses
+from neilfpp_method.effects.review import POSE_STEPS, review_poses
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields.poses import PoseCorrections, PoseMotion
 from neilfpp_method.model import NeilfModel
@@ -206,6 +206,16 @@ def test_evidence_decides(ball, degrees, on):
     assert plan.config.train.pose_fits == (12 if on else 0)
     assert plan.config_of_model.train.pose_fits == 12
     assert review_poses(plan, model, pixels, 700) == []
+
+
+def test_nothing_is_concluded_from_a_blurred_model(ball):
+    capture = disturbed(ball, motions(1.0))
+    plan, model = Plan.begin(parse_effects("auto"), preset("fast")), model_of(Ball())
+    pixels = PixelDataset(capture, capture.train_views)
+    (decision,) = review_poses(plan, model, pixels, POSE_STEPS - 1)
+    assert not decision.on
+    assert decision.reason.startswith("not measured: R is blurred")
+    assert review_poses(plan, model, pixels, POSE_STEPS) == []
 
 
 def test_poses_are_not_fitted_to_a_given_surface():

@@ -170,7 +170,7 @@ def test_noisy_poses_are_corrected(tmp_path, degrees):
     noise = motions(degrees, views=VIEWS)
     true = photographed(tmp_path / "boxes", noise)
     config = changed(
-        small_config(sdf_steps=300, material_steps=0, joint_steps=0, rays=160, checkpoint_every=300),
+        small_config(sdf_steps=700, material_steps=0, joint_steps=0, rays=160, checkpoint_every=700),
         {
             "host.sdf.width": 32,
             "encoding.levels": 4,
