@@ -40,6 +40,7 @@ NAMES = (
     "effects.md",
     "hosts.md",
     "light.md",
+    "machines.md",
     "relighting.md",
 )
 DOCUMENTS = tuple(ROOT / "docs" / name for name in NAMES)
@@ -58,6 +59,9 @@ class Column:
 
 
 COLUMNS: Mapping[str, Column] = {
+    "step_ms": Column("ms a step", 0),
+    "kernels": Column("kernels", 0),
+    "computing_ms": Column("GPU computes, ms", 1),
     "relight_psnr": Column("PSNR"),
     "relight_psnr_scaled": Column("PSNR, scale aligned"),
     "relight_psnr_linear_scaled": Column("linear radiance"),

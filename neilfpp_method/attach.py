@@ -297,7 +297,7 @@ def attach_neilf(
     """Put the material field, the light and their losses on top of a host.
 
     One log line names the optional methods that the host lacks and the step at which its material starts. The
-    global random state is not changed.
+    parts are on the device of the host's parameters. The global random state is not changed.
 
     Args:
         host: an object with `render(rays) -> SurfaceHits`; an object with `render_image(camera) ->
@@ -339,8 +339,15 @@ def attach_neilf(
         attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
     if config.known_map is not None:
         attached.model.light.show(read_environment(Path(config.known_map)))
+    attached.to(_device_of(host))
     log.warning("NeILF++ attached to %s: %s", host_name(adapted), _attachment_summary(attached, borrowed))
     return attached
+
+
+def _device_of(host: Any) -> torch.device:
+    """The device of the host's first parameter; the default device if it has none."""
+    parameters = host.parameters() if isinstance(host, nn.Module) else iter(())
+    return next((p.device for p in parameters), torch.get_default_device())
 
 
 def _facts(

@@ -412,3 +412,10 @@ def test_rays_and_fields_on_two_devices_are_named():
     neilf = attach_neilf(Ball(), tiny_config())
     with pytest.raises(UserError, match="rays on meta, material and light on cpu; move one of them"):
         neilf.losses(pixels().to("meta"), Stage.MATERIAL_INIT)
+
+
+def test_the_parts_are_on_the_device_of_the_host():
+    """The meta device stands for a GPU: tensors there have no values."""
+    neilf = attach_neilf(BallHost().to("meta"), tiny_config())
+    assert {p.device.type for p in neilf.parameters()} == {"meta"}
+    assert {p.device.type for p in attach_neilf(BallHost(), tiny_config()).parameters()} == {"cpu"}

@@ -70,17 +70,15 @@ def test_encoding_agrees_with_the_reference(dtype, close, jacobian):
 
 
 def test_maps_agree_with_the_cpu():
-    """Whole images of an untrained model differ by rounding: where a ray is lit changes with the digits of
-    its samples, so that few pixels may differ more.
-    """
+    """Samples differ a little: on a CPU, rays whose samples are accurate enough get no further ones."""
     model = sphere_model().eval()
     rays = sphere_batch(400).rays
     expected = model.maps(rays)
     found = copy.deepcopy(model).to(DEVICE).maps(rays.to(DEVICE))
-    for name in ("rgb_volume", "opacity", "base_color", "normal"):
+    for name, close in (("rgb_volume", 1e-3), ("opacity", 1e-3), ("base_color", 1e-3), ("normal", 1e-2)):
         difference = (getattr(found, name).cpu() - getattr(expected, name)).abs().amax(-1)
-        assert float(difference.median()) < 1e-4, name
-        assert float(difference.quantile(0.95)) < 1e-2, name
+        assert float(difference.median()) < close, name
+        assert float(difference.quantile(0.95)) < 5 * close, name
 
 
 @pytest.mark.parametrize("background", ["constant", "surrounding"])

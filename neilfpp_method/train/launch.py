@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 
 import torch
@@ -34,6 +35,8 @@ def launch(device: torch.device, devices: int, nodes: int) -> Fabric:
             f"--device {device} has fewer than {devices} GPUs",
             "use --device cuda, and --devices up to the number of GPUs",
         )
+    # Its hint on GPUs, to multiply matrices in TF32, would roughen the normals of the surface.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     fabric = Fabric(
         accelerator=device.type,
         devices=devices if device.index is None else [device.index],
