@@ -3,8 +3,8 @@
     python -m benchmarks.gpu_steps --presets fast paper-ngp --save gpu-steps
     python -m benchmarks.gpu_steps --presets fast --rays 4096
 
-The scene is that of `benchmarks.steps`. If the GPU computes for a small part of a step, the rest is the launching
-of its kernels, and more rays per step take hardly more time.
+The scene is that of `benchmarks.steps`. If the GPU computes for a small part of a step, the rest is the
+launching of its kernels, and more rays per step take hardly more time.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def measured(model: NeilfModel, stage: Stage, rays: int) -> dict[str, float]:
 def main(options: Options, console: Console) -> None:
     """Print the table, and write it into a result file if one is named."""
     if not torch.cuda.is_available():
-        raise UserError("no GPU here", "run this on a machine with CUDA; `python -m benchmarks steps` needs none")
+        raise UserError("no GPU here", "use a machine with CUDA; `python -m benchmarks steps` needs none")
     rows = []
     for name in options.presets:
         rays = options.rays or preset(name).train.rays
