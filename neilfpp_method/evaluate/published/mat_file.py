@@ -18,6 +18,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -48,14 +49,16 @@ def read_matrices(path: Path, wanted: Mapping[str, int]) -> dict[str, np.ndarray
         data = memoryview(path.read_bytes())
         order = {b"IM": "<", b"MI": ">"}[bytes(data[HEADER - 2 : HEADER])]
         for element in _elements(data[HEADER:], order):
-            parts = [element]
             if element.kind == COMPRESSED:
                 unpacked = zlib.decompressobj().decompress(element.content, LARGEST_ELEMENT)
-                parts = list(_elements(memoryview(unpacked), order))
-            for matrix in (part for part in parts if part.kind == MATRIX):
-                flags, axes, name, *values = _elements(matrix.content, order)
-                if (word := bytes(name.content).decode("latin-1")) in wanted:
-                    found[word] = _numbers(flags, axes, values, order, wanted[word])
+                element = next(_elements(memoryview(unpacked), order))
+            if element.kind != MATRIX:
+                continue
+            parts = _elements(element.content, order)
+            flags, axes, name = islice(parts, 3)
+            if (word := bytes(name.content).decode("latin-1")) in wanted:
+                (values,) = parts
+                found[word] = _numbers(flags, axes, values, order, wanted[word])
     except Exception as error:
         # Forged bytes can raise many types of exceptions when they are unpacked.
         raise UserError(
@@ -88,14 +91,14 @@ def _elements(block: memoryview, order: str) -> Iterator[_Element]:
 
 
 def _numbers(
-    flags: _Element, axes: _Element, values: list[_Element], order: str, expected_axes: int
+    flags: _Element, axes: _Element, values: _Element, order: str, expected_axes: int
 ) -> np.ndarray:
     """The array of a matrix element."""
     (word,) = struct.unpack_from(f"{order}I", flags.content)
     shape = tuple(np.frombuffer(axes.content, f"{order}i4").tolist())
-    if word & COMPLEX or len(shape) != expected_axes or min(shape) < 0 or len(values) != 1:
+    if word & COMPLEX or len(shape) != expected_axes or min(shape) < 0:
         raise ValueError(f"an array of the shape {shape}")
-    flat = np.frombuffer(values[0].content, order + TYPES[values[0].kind])
+    flat = np.frombuffer(values.content, order + TYPES[values.kind])
     if len(flat) != math.prod(shape):
         raise ValueError(f"{len(flat)} numbers for the shape {shape}")
     return flat.reshape(shape, order="F").astype(CLASSES[word & 0xFF])

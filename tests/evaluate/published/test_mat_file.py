@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import struct
+import time
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -67,3 +69,15 @@ def test_values_without_bytes_do_not_crash(tmp_path: Path) -> None:
     begin = data.index(struct.pack("<II", 9, 72))
     path.write_bytes(data[:begin])
     refused(path, a=2)
+
+
+def test_millions_of_tiny_elements_are_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "a.mat"
+    savemat(path, {"a": np.eye(3)})
+    data = path.read_bytes()
+    parts = data[136:] + bytes(2**26)  # flags, axes, name and values of the array, then empty elements
+    deflated = zlib.compress(struct.pack("<II", 14, len(parts)) + parts)
+    path.write_bytes(data[:128] + struct.pack("<II", 15, len(deflated)) + deflated)
+    began = time.process_time()
+    assert "too many values" in refused(path, a=2)
+    assert time.process_time() - began < 1.0
