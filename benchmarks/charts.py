@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from neilfpp_method.data.images import write_png
-from neilfpp_method.evaluate.pictures import INK, PALE_INK, PAPER
+from neilfpp_method.drawing.ink import PALE_INK, PAPER, write
 
 __all__ = ["Chart", "Line", "draw_charts"]
 
@@ -64,11 +64,11 @@ def draw_charts(
     head = HEAD + LEGEND * math.ceil(len(names) / per_line)
     sheet = Image.new("RGB", (width, head + rows * (TOP + HEIGHT + BOTTOM)), PAPER)
     draw = ImageDraw.Draw(sheet)
-    _write(draw, (GAP, 16), title, 22)
+    write(draw, (GAP, 16), title, 22)
     for number, name in enumerate(names):
         x, y = GAP + number % per_line * 250, HEAD + number // per_line * LEGEND
         draw.line([(x, y + 9), (x + 26, y + 9)], fill=colors[name], width=3)
-        _write(draw, (x + 34, y), name, 15)
+        write(draw, (x + 34, y), name, 15)
     for number, chart in enumerate(charts):
         corner = (
             number % columns * (LEFT + WIDTH + GAP) + LEFT,
@@ -107,16 +107,16 @@ def _panel(
     colors: Mapping[str, tuple[int, int, int]],
 ) -> None:
     left, top = corner
-    _write(draw, (left, top - 26), chart.title, 16)
+    write(draw, (left, top - 26), chart.title, 16)
     for tick in _ticks(*axes.x):
         x, _ = axes.place(corner, tick, 10 ** axes.y[0])
         draw.line([(x, top), (x, top + HEIGHT)], fill=GRID)
-        _write(draw, (x - 8, top + HEIGHT + 4), f"{tick:g}", 12, PALE_INK)
+        write(draw, (x - 8, top + HEIGHT + 4), f"{tick:g}", 12, PALE_INK)
     for tick in _ticks(*axes.y):
         _, y = axes.place(corner, 10 ** axes.x[0], tick)
         draw.line([(left, y), (left + WIDTH, y)], fill=GRID)
-        _write(draw, (left - 44, y - 8), f"{tick:g}", 12, PALE_INK)
-    _write(draw, (left, top + HEIGHT + 20), axes.caption, 12, PALE_INK)
+        write(draw, (left - 44, y - 8), f"{tick:g}", 12, PALE_INK)
+    write(draw, (left, top + HEIGHT + 20), axes.caption, 12, PALE_INK)
     for name, line in chart.lines.items():
         points = [axes.place(corner, x, y) for x, y in zip(line.x, line.y, strict=True)]
         draw.line(points, fill=colors[name], width=3, joint="curve")
@@ -131,13 +131,3 @@ def _ticks(low: float, high: float) -> list[float]:
         step * 10.0**power for power in range(math.floor(low), math.ceil(high) + 1) for step in steps
     ]
     return [tick for tick in candidates if low <= math.log10(tick) <= high]
-
-
-def _write(
-    draw: ImageDraw.ImageDraw,
-    corner: tuple[float, float],
-    text: str,
-    size: int,
-    color: tuple[int, int, int] = INK,
-) -> None:
-    draw.text(corner, text, font=ImageFont.load_default(size), fill=color)

@@ -19,7 +19,7 @@ SOURCES = {
 # A package may import packages to its left and itself; packages of one layer do not import each other. Lower
 # is right.
 LAYERS: tuple[tuple[str, ...], ...] = (
-    ("errors", "stratified", "structures", "timing"),
+    ("drawing", "errors", "stratified", "structures", "timing"),
     ("settings",),
     ("kernels",),
     ("shading", "schedule"),
@@ -44,8 +44,8 @@ LAYERS: tuple[tuple[str, ...], ...] = (
 # settings included.
 ONLY = {
     "data": {"errors", "structures", "shading.color"},
-    "prepare": {"errors", "structures", "shading.color", "data", "inspection"},
-    "inspection": {"errors", "structures", "shading.color", "data"},
+    "prepare": {"drawing", "errors", "structures", "shading.color", "data", "inspection"},
+    "inspection": {"drawing", "errors", "structures", "shading.color", "data"},
     "structures": set(),
     "errors": set(),
 }

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
+from neilfpp_method.evaluate.contact_sheet import Group, PictureRow, Section, contact_sheet
 from neilfpp_method.evaluate.panels import ComparedMap
-from neilfpp_method.evaluate.pictures import Group, PictureRow, Section, contact_sheet
 from neilfpp_method.report.measured import count_of_views
 from neilfpp_method.report.views import title_of
 

@@ -11,10 +11,8 @@ from jaxtyping import Float
 
 from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
+from neilfpp_method.evaluate.contact_sheet import Group, PictureRow, Section
 from neilfpp_method.evaluate.pictures import (
-    Group,
-    PictureRow,
-    Section,
     auto_exposure,
     cut_out,
     display_color,

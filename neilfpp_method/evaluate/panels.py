@@ -9,17 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
+from neilfpp_method.evaluate.contact_sheet import Group, PictureRow, Section
 from neilfpp_method.evaluate.metrics import align_scale
-from neilfpp_method.evaluate.pictures import (
-    Group,
-    PictureRow,
-    Section,
-    auto_exposure,
-    cut_out,
-    display,
-    display_color,
-    display_error,
-)
+from neilfpp_method.evaluate.pictures import auto_exposure, cut_out, display, display_color, display_error
 from neilfpp_method.evaluate.views import KnownView, RenderedView
 from neilfpp_method.shading.color import srgb_to_linear
 from neilfpp_method.train.run import Run

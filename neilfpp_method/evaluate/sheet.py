@@ -8,9 +8,9 @@ from pathlib import Path
 
 from neilfpp_method.data.images import write_png
 from neilfpp_method.evaluate.confidence import DISPLAY_STEP, measure_residuals, with_deviation
+from neilfpp_method.evaluate.contact_sheet import contact_sheet
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.panels import albedo_scale, view_sections
-from neilfpp_method.evaluate.pictures import contact_sheet
 from neilfpp_method.evaluate.views import RenderedView, evenly_spread, known_test_views, render_view
 from neilfpp_method.schedule import total_steps
 from neilfpp_method.train.run import Run

@@ -5,15 +5,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from neilfpp_method.drawing.ink import PALE_INK, PAPER, Color, write
 from neilfpp_method.inspection.defects import Inspection
 from neilfpp_method.shading.color import tone_map
 
 __all__ = ["draw"]
 
-PAPER, INK, PALE_INK = (250, 250, 248), (28, 30, 34), (150, 154, 160)
-"""Colours of the background, of text, and of secondary text."""
 PROBLEM, WARNING, FINE = (200, 40, 40), (225, 150, 20), (70, 130, 180)
 """Frame colours of views with a problem, with a warning, and without defects."""
 SEVEREST_FIRST = (PROBLEM, WARNING, FINE)
@@ -40,8 +39,8 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
     sheet = Image.new("RGB", (width, top + rows * (CELL + LABEL + GAP) + MARGIN), PAPER)
     pen = ImageDraw.Draw(sheet)
     radiance, capture = inspection.radiance, inspection.capture
-    _write(pen, (MARGIN, MARGIN - 6), f"{capture.root.resolve().name}: {len(capture.views)} views", 26)
-    _write(pen, (MARGIN, MARGIN + 32), f"radiance {radiance.level}: {radiance.text}", 16, PALE_INK)
+    write(pen, (MARGIN, MARGIN - 6), f"{capture.root.resolve().name}: {len(capture.views)} views", 26)
+    write(pen, (MARGIN, MARGIN + 32), f"radiance {radiance.level}: {radiance.text}", 16, PALE_INK)
     for k, (axes, title) in enumerate([((0, 1), "along z (x, y)"), ((0, 2), "along y (x, z)")]):
         plan = Image.fromarray(_plan(inspection, axes, colors, title))
         sheet.paste(plan, (MARGIN + k * (PLAN + 2 * GAP), MARGIN + 70))
@@ -53,12 +52,12 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
         picture = Image.fromarray(_shown(view.small, exposure))
         kinds = [d.kind.replace("_", " ") for d in inspection.defects if view.name in d.views]
         _cell(sheet, pen, corner, picture, colors[i])
-        _write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
-        _write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, colors[i])
+        write(pen, (corner[0], corner[1] + CELL + 4), view.name[:22], 14)
+        write(pen, (corner[0], corner[1] + CELL + 21), ", ".join(kinds)[:26], 12, colors[i])
     return np.asarray(sheet)
 
 
-def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
+def _colors(inspection: Inspection) -> list[Color]:
     problems = {
         name for defect in inspection.defects if defect.severity == "problem" for name in defect.views
     }
@@ -69,7 +68,7 @@ def _colors(inspection: Inspection) -> list[tuple[int, int, int]]:
 
 
 def _plan(
-    inspection: Inspection, axes: tuple[int, int], colors: list[tuple[int, int, int]], title: str
+    inspection: Inspection, axes: tuple[int, int], colors: list[Color], title: str
 ) -> UInt8[np.ndarray, "_ _ 3"]:
     """Plot cameras as dots with viewing directions, projected along a world axis, with the unit sphere."""
     plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
@@ -86,7 +85,7 @@ def _plan(
     ):
         pen.line([*start, *end], fill=color, width=2)
         pen.ellipse([*(start - 4), *(start + 4)], fill=color)
-    _write(pen, (10, 8), title, 14, PALE_INK)
+    write(pen, (10, 8), title, 14, PALE_INK)
     return np.asarray(plan)
 
 
@@ -94,9 +93,9 @@ def _list(pen: ImageDraw.ImageDraw, corner: tuple[int, int], inspection: Inspect
     for place, defect in enumerate(inspection.defects):
         count = f": {len(defect.views)} view{'s' * (len(defect.views) != 1)}" if defect.views else ""
         color = PROBLEM if defect.severity == "problem" else WARNING
-        _write(pen, (corner[0], corner[1] + 26 * place), defect.kind.replace("_", " ") + count, 16, color)
+        write(pen, (corner[0], corner[1] + 26 * place), defect.kind.replace("_", " ") + count, 16, color)
     if not inspection.defects:
-        _write(pen, corner, "no problems found", 16, FINE)
+        write(pen, corner, "no problems found", 16, FINE)
 
 
 def _cell(
@@ -104,7 +103,7 @@ def _cell(
     pen: ImageDraw.ImageDraw,
     corner: tuple[int, int],
     picture: Image.Image,
-    color: tuple[int, int, int],
+    color: Color,
 ) -> None:
     """Draw a view in a frame of the given colour."""
     picture.thumbnail((CELL, CELL))
@@ -116,9 +115,3 @@ def _cell(
 
 def _shown(radiance: Float[np.ndarray, "h w 3"], exposure: float) -> UInt8[np.ndarray, "h w 3"]:
     return (tone_map(torch.from_numpy(radiance * np.float32(exposure))).numpy() * 255 + 0.5).astype(np.uint8)
-
-
-def _write(
-    pen: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, size: int, color: tuple[int, int, int] = INK
-) -> None:
-    pen.text(corner, text, font=ImageFont.load_default(size), fill=color)

@@ -7,18 +7,16 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.data.views import Normalization, View
+from neilfpp_method.drawing.ink import INK, PALE_INK, PAPER, write
 from neilfpp_method.prepare.summary import Placement
 
 __all__ = ["draw_fit", "draw_scene", "write_picture"]
-
-BACKGROUND, INK, PALE = (250, 250, 248), (28, 30, 34), (176, 180, 186)
-"""sRGB colours of the background, of text, and of axes."""
 
 TRAIN, TEST, MISSING = (42, 92, 170), (222, 128, 20), (190, 40, 50)
 """sRGB colours of training cameras, of test cameras, and of images without a pose."""
@@ -78,17 +76,17 @@ def draw_scene(
     center = np.array(box.center)
     reach = 1.08 * float(np.abs(pyramids - center).max(initial=1.2 * box.scale))
     rows = np.random.default_rng(0).permutation(len(points.position))[:MAX_POINTS]
-    sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + TITLE), BACKGROUND)
+    sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + 2 * MARGIN + TITLE), PAPER)
     sides = {"from above": (0, 1, 2), "from the side": (0, 2, 1)}
     for i, (title, (right, up, depth)) in enumerate(sides.items()):
         # Far points are drawn first. The side view looks along +y, so near points have a small y.
         flip = -1.0 if title == "from the side" else 1.0
         order = rows[np.argsort(flip * points.position[rows, depth])]
-        panel = Image.new("RGB", (SUPERSAMPLING * PANEL, SUPERSAMPLING * PANEL), BACKGROUND)
+        panel = Image.new("RGB", (SUPERSAMPLING * PANEL, SUPERSAMPLING * PANEL), PAPER)
         draw = ImageDraw.Draw(panel)
         project = _Projection(center[[right, up]], reach, right, up)
         circle = project(center) + np.array([[-1.0], [1.0]]) * SUPERSAMPLING * PANEL / 2 * box.scale / reach
-        draw.ellipse([*map(float, circle.reshape(-1))], outline=PALE, width=SUPERSAMPLING)
+        draw.ellipse([*map(float, circle.reshape(-1))], outline=PALE_INK, width=SUPERSAMPLING)
         colors = np.rint(127.5 * (points.normal[order] + 1.0)).astype(np.uint8)
         for (x, y), color in zip(project(points.position[order]), colors, strict=True):
             draw.rectangle([x - 1, y - 1, x + 1, y + 1], fill=tuple(map(int, color)))
@@ -100,25 +98,25 @@ def draw_scene(
                 draw.line([eye, corner], fill=color, width=SUPERSAMPLING)
         left = MARGIN + i * (PANEL + MARGIN)
         sheet.paste(panel.resize((PANEL, PANEL), Image.Resampling.LANCZOS), (left, MARGIN + TITLE))
-        _write(ImageDraw.Draw(sheet), (left, MARGIN // 2), title, TITLE)
-    _write(ImageDraw.Draw(sheet), (2 * PANEL - 380, MARGIN // 2 + 6), "training cameras", NOTE, TRAIN)
-    _write(ImageDraw.Draw(sheet), (2 * PANEL - 210, MARGIN // 2 + 6), "test cameras", NOTE, TEST)
-    _write(ImageDraw.Draw(sheet), (2 * PANEL - 110, MARGIN // 2 + 6), "points, coloured by normal", NOTE, INK)
+        write(ImageDraw.Draw(sheet), (left, MARGIN // 2), title, TITLE)
+    write(ImageDraw.Draw(sheet), (2 * PANEL - 380, MARGIN // 2 + 6), "training cameras", NOTE, TRAIN)
+    write(ImageDraw.Draw(sheet), (2 * PANEL - 210, MARGIN // 2 + 6), "test cameras", NOTE, TEST)
+    write(ImageDraw.Draw(sheet), (2 * PANEL - 110, MARGIN // 2 + 6), "points, coloured by normal", NOTE, INK)
     return np.asarray(sheet)
 
 
 def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 3"]:
     """Draw the reprojection error of each image as a bar; images without a pose get a full red bar."""
-    sheet = Image.new("RGB", (width, CHART_HEIGHT + AXIS_HEIGHT + MARGIN), BACKGROUND)
+    sheet = Image.new("RGB", (width, CHART_HEIGHT + AXIS_HEIGHT + MARGIN), PAPER)
     draw = ImageDraw.Draw(sheet)
-    _write(draw, (MARGIN, 0), "reprojection error of each image, pixels", NOTE)
+    write(draw, (MARGIN, 0), "reprojection error of each image, pixels", NOTE)
     errors = [p.error for p in placed if p.error is not None]
     top = max(TICK, TICK * np.ceil(max(errors, default=TICK) / TICK))
     base, height = CHART_HEIGHT + 24, CHART_HEIGHT - 10
     for value in np.arange(0.0, top + TICK / 2, TICK):
         y = base - height * value / top
-        draw.line([(2 * MARGIN, y), (width - MARGIN, y)], fill=PALE)
-        _write(draw, (MARGIN, int(y) - 9), f"{value:.1f}", NOTE)
+        draw.line([(2 * MARGIN, y), (width - MARGIN, y)], fill=PALE_INK)
+        write(draw, (MARGIN, int(y) - 9), f"{value:.1f}", NOTE)
     step = (width - 3 * MARGIN) / len(placed)
     label_every = max(1, -(-LABEL_SPACING // max(int(step), 1)))
     for i, placement in enumerate(placed):
@@ -126,7 +124,7 @@ def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 
         share, color = (1.0, MISSING) if placement.error is None else (placement.error / top, TRAIN)
         draw.rectangle([left + 0.15 * step, base - height * share, left + 0.85 * step, base], fill=color)
         if i % label_every == 0:
-            _write(draw, (int(left), base + 6), placement.name[-8:], LABEL)
+            write(draw, (int(left), base + 6), placement.name[-8:], LABEL)
     return np.asarray(sheet)
 
 
@@ -151,13 +149,3 @@ def _pyramid(camera: Camera, scale: float) -> Float64[np.ndarray, "5 3"]:
     )
     rays *= PYRAMID_SIZE * scale / np.abs(rays[:, :2]).max()
     return np.concatenate([np.zeros((1, 3)), rays]) @ camera.c2w[:, :3].T + camera.c2w[:, 3]
-
-
-def _write(
-    draw: ImageDraw.ImageDraw,
-    corner: tuple[int, int],
-    text: str,
-    size: int,
-    color: tuple[int, int, int] = INK,
-) -> None:
-    draw.text(corner, text, font=ImageFont.load_default(size), fill=color)

@@ -10,10 +10,10 @@ from jaxtyping import Float
 
 from neilfpp_method.data.scaling import at_scale, file_size
 from neilfpp_method.evaluate.confidence import DISPLAY_STEP, measure_residuals, with_deviation
+from neilfpp_method.evaluate.contact_sheet import Section
 from neilfpp_method.evaluate.light_panels import light_sections
 from neilfpp_method.evaluate.map_metrics import image_metrics, material_metrics, normal_metrics
 from neilfpp_method.evaluate.panels import ComparedMap, albedo_scale, compared_maps
-from neilfpp_method.evaluate.pictures import Section
 from neilfpp_method.evaluate.views import RenderedView, evenly_spread, known_test_views, render_view
 from neilfpp_method.report.data_urls import image_url
 from neilfpp_method.train.run import Run

@@ -5,13 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from neilfpp_method.drawing.ink import PAPER
+from neilfpp_method.evaluate.contact_sheet import Group, PictureRow, Section, contact_sheet
 from neilfpp_method.evaluate.pictures import (
-    PAPER,
-    Group,
-    PictureRow,
-    Section,
     auto_exposure,
-    contact_sheet,
     cut_out,
     display,
     display_color,

@@ -90,9 +90,7 @@ def _elements(block: memoryview, order: str) -> Iterator[_Element]:
         block = block[begin + length + padding :]
 
 
-def _numbers(
-    flags: _Element, axes: _Element, values: _Element, order: str, expected_axes: int
-) -> np.ndarray:
+def _numbers(flags: _Element, axes: _Element, values: _Element, order: str, expected_axes: int) -> np.ndarray:
     """The array of a matrix element."""
     (word,) = struct.unpack_from(f"{order}I", flags.content)
     shape = tuple(np.frombuffer(axes.content, f"{order}i4").tolist())

@@ -1,0 +1,1 @@
+"""What all drawn pictures share: their colours, and text."""
