@@ -62,6 +62,11 @@ class SdfField(nn.Module):
         sample = self.mlp.with_gradient(encoded.features, slice(0, 1))
         return SdfSample(sample.value[:, 0], pull_back(sample.gradient, encoded)[:, 0], sample.value[:, 1:])
 
+    @torch.no_grad()
+    def lower_(self, amount: float) -> None:
+        """Subtract a constant from the distance everywhere."""
+        self.mlp.layers[-1].bias[0] -= amount
+
     def hessian(
         self, x: Float[Tensor, "N 3"], method: Literal["analytic", "finite_difference"] | None = None
     ) -> Float[Tensor, "N 3 3"]:

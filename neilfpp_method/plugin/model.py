@@ -52,6 +52,7 @@ from neilfpp_method.train.optimizer import (
     set_rates,
     waiting_fields,
 )
+from neilfpp_method.train.vanished import restore_surface
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
 
@@ -248,6 +249,8 @@ class NeilfMethod(Model):
         """Bound β, solve for the light and search the material if due, after the optimizer's step."""
         settings = self.config.neilf
         limit_surface_width(self.neilf.host, settings.volume, stage_at(step, settings.train))
+        if restore_surface(self.neilf.host, stage_at(step + 1, settings.train)):
+            CONSOLE.log(f"step {step + 1}: the surface had vanished and is restored")
         if self.computed is None:
             return
         self.light_solver.observe(self.computed)

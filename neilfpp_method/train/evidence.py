@@ -92,6 +92,7 @@ def _start_light(run: Training, step: int) -> None:
     model = run.model
     decisions: list[Decision] = []
     if run.fabric.is_global_zero:
+        run.reporter.say("fitting light and material at selected places, to decide on effects …")
         seed_stream(run.config.train.seed, Stream.LIGHT, step)
         review = review_light(run.plan, model, run.pixels, step, _max_light_pixels(run))
         decisions, first = review.decisions, review.first

@@ -63,6 +63,7 @@ from neilfpp_method.train.optimizer import (
 from neilfpp_method.train.quality import read_checks, write_checks
 from neilfpp_method.train.skipped import Moment, keep_step
 from neilfpp_method.train.training import Training
+from neilfpp_method.train.vanished import restore_surface
 from neilfpp_method.train.work_record import write_work
 
 __all__ = ["train"]
@@ -119,6 +120,8 @@ def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: Stag
         number, step = number + 1, step + 1
         length = _keep_pace(run, StagePosition(stage, number, length), step)
         reached = StagePosition(stage, number, length)
+        if restore_surface(model.host, reached):
+            run.reporter.say(f"step {step}: the surface had vanished and is restored")
         fit_poses(run, reached, step)
         search_material(run, reached, step)
         _check_quality(run, reached, step)
