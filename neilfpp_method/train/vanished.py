@@ -23,8 +23,8 @@ EVERY = 20
 """Number of steps between two checks."""
 UNTIL = 0.5
 """Share of SDF init after which the surface is left alone."""
-GRID = 24
-"""Points along an edge of the checked grid, which spans the scene sphere."""
+GRID = 32
+"""Points along an edge of the checked grid over the scene sphere; it does not miss a ball of radius 0.05."""
 WIDTHS = 6.0
 """Distance from the surface, in units of β, beyond which nothing is learned. The density there is e⁻⁶ of its
 maximum.
