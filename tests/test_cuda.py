@@ -19,7 +19,6 @@ from neilfpp_method.kernels import encode, grid_spec
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import RayBatch
 from tests.calls import train_tiny
 from tests.hosts.balls import BallHost, ball_rays
 from tests.hosts.test_mesh import SPHERE, mesh_host
@@ -171,8 +170,3 @@ def test_relights(trained, tmp_path):
     arguments = ["relight", str(trained), "--env", str(sky), "--spp", "4", "--device", DEVICE]
     assert main([*arguments, "--out", str(tmp_path / "relit")]) == 0
     assert list((tmp_path / "relit").rglob("*.exr"))
-
-
-def test_rays_move_with_their_device():
-    rays = RayBatch(torch.zeros(2, 3), torch.ones(2, 3)).to(DEVICE)
-    assert rays.origins.device.type == DEVICE
