@@ -26,8 +26,8 @@ UNTIL = 0.5
 GRID = 32
 """Points along an edge of the checked grid over the scene sphere; it does not miss a ball of radius 0.05."""
 WIDTHS = 6.0
-"""Distance from the surface, in units of β, beyond which nothing is learned: the density is e⁻⁶ of that on the
-surface.
+"""Distance from the surface, in units of β, beyond which nothing is learned: the density is e⁻⁶ of that on
+the surface.
 """
 INSIDE = 0.1
 """Share of the unit sphere that is inside afterwards. 0.05 and 0.1 gave the same quality."""
