@@ -26,6 +26,10 @@ __all__ = ["border_color", "border_colors", "border_median"]
 BORDER_TOLERANCE = 0.02
 """Largest deviation of a background pixel from the background colour, relative to the brighter of that colour
 and the median of the object."""
+MIN_OTHER_SHARE = 0.01
+"""Share of the border pixels up to which other colours do not count: pixels at the outline of an object that
+extends beyond the image show a mixture of object and background.
+"""
 MAX_RAYS = 1000
 """Largest number of rays that are tested."""
 PLACES = 65
@@ -41,7 +45,8 @@ def border_color(pixels: PixelDataset) -> Float[Tensor, " 3"] | None:
 
     The background colour is the median of the border, if at least half of the border pixels differ from it by
     at most 2 % of the brighter of that colour and the object's median radiance, and if the other border
-    pixels can lie within the scene, which fails if that colour is the ground and the others are the sky.
+    pixels are few or can lie within the scene, which fails if that colour is the ground and the others are
+    the sky. Pixels that a mask assigns to the object do not count.
     """
     numbers, views = border(pixels.store)
     color = border_median(pixels)
@@ -55,6 +60,8 @@ def border_color(pixels: PixelDataset) -> Float[Tensor, " 3"] | None:
     others = numbers[differs(pixels.store.colors(numbers, views)).numpy()]
     if len(others) > (1 - BORDER_SHARE) * len(numbers):
         return None
+    if len(others) <= MIN_OTHER_SHARE * len(numbers):
+        return color
     return color if _within_the_scene(pixels, others, differs) else None
 
 

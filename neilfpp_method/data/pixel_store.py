@@ -266,13 +266,18 @@ def _median(values: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, " C"]:
 
 
 def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " B"]]:
-    """Return the indices of the valid pixels on the borders of all images, and their views."""
+    """Return the indices of the valid pixels on the borders of all images, and their views.
+
+    Pixels that a mask assigns to the object are left out: an object that extends beyond the image is not a
+    part of the background.
+    """
     numbers, views = [], []
     for i, view in enumerate(store.views):
         width, height = view.camera.width, view.camera.height
         row, left = np.arange(width), np.arange(1, height - 1) * width
         edge = store.starts[i] + np.concatenate([row, (height - 1) * width + row, left, left + width - 1])
-        edge = edge[(store.bits[edge] & VALID) > 0]
+        bits = store.bits[edge]
+        edge = edge[(bits & VALID > 0) & (bits & (KNOWN | MASK) != KNOWN | MASK)]
         numbers.append(edge)
         views.append(np.full(len(edge), i))
     return np.concatenate(numbers), np.concatenate(views)

@@ -304,6 +304,23 @@ def test_no_border_color_if_the_border_varies(tmp_path: Path) -> None:
     assert border_color(PixelDataset(capture, capture.views)) is None
 
 
+def test_an_object_beyond_the_image_does_not_change_the_border_color(tmp_path: Path) -> None:
+    """One view shows a part of the object that lies outside of all other views, so no hull contains it."""
+    root = make_capture(tmp_path, masks=True)
+    image, mask = root / "inputs" / "images" / "002.exr", root / "inputs" / "masks" / "002.png"
+    color = OpenEXR.File(str(image)).channels()["RGB"].pixels
+    color[:9, :8] = 0.5
+    write_exr(image, {"RGB": color})
+    on_object = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE)
+    on_object[:9, :7] = 255
+    write_png(mask, on_object)
+    capture = load_capture(root)
+    # The last column of the added part is not in the mask: a mixture of object and background.
+    pixels = PixelDataset(capture, capture.views)
+    assert 0 < (border_colors(pixels) == 0.5).any(-1).mean() < 0.01
+    assert torch.equal(border_color(pixels), torch.zeros(3))
+
+
 def test_no_border_color_under_a_sky(tmp_path: Path) -> None:
     """Most of the border is ground. The rest is sky, which cannot be a part of the scene."""
     capture = load_capture(make_sky_capture(tmp_path))
