@@ -241,7 +241,8 @@ class SceneLight(Indexable):
     Attributes:
         hit: whether the ray from the point along the direction meets a surface.
         radiance: linear radiance that arrives from there; 0 without a hit.
-        distance: distance to the surface, scene units; infinite without a hit.
+        distance: distance from the point to the surface, scene units; infinite without a hit. It is measured
+            from the point itself, also if the ray starts above it, so that it compares with that of a lamp.
     """
 
     hit: Bool[Tensor, "N S"]

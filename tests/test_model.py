@@ -14,6 +14,7 @@ import torch
 from neilfpp_method import losses
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import TracesLight
+from neilfpp_method.incident.scene import scene_light
 from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
@@ -292,6 +293,12 @@ def test_hard_inter_reflection_uses_the_scene_for_hits_and_the_light_otherwise()
     torch.testing.assert_close(arriving[~below], sky[~below])
 
 
+def test_the_distance_of_rendered_light_is_measured_from_the_point():
+    wi = torch.nn.functional.normalize(torch.randn(1, 64, 3), dim=-1)
+    light = scene_light(Room(), torch.zeros(1, 3), wi, offset=0.1, hit_share=0.5)
+    torch.testing.assert_close(light.distance, torch.full((1, 64), 2.0))
+
+
 def test_an_sdf_host_traces_its_grid():
     """From a point on a sphere no direction hits it again; from between two plates every steep direction hits
     one.
@@ -309,8 +316,11 @@ def test_an_sdf_host_traces_its_grid():
     assert not host.scene_light(on_sphere, up).hit.any()
     towards = host.scene_light(3.0 * out / 2, -up)
     assert towards.hit[0, 0]
-    # The radiance is that of R at the hit.
     hits = host.render(RayBatch(3.0 * out / 2, -out))
+    # The ray starts a cell of the grid (0.037) above the point, but its distance is measured from the point.
+    met = 3.0 * out / 2 - towards.distance[0, :1, None] * out
+    assert host.sdf_field.with_gradient(met).distance.abs().item() < 0.01
+    # The radiance is that of R at the hit.
     torch.testing.assert_close(towards.radiance[0, 0], hits.color[0], atol=0.05, rtol=0.0)
     assert not towards.radiance.requires_grad
 

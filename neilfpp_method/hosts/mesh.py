@@ -130,7 +130,7 @@ class MeshHost(nn.Module):
         origins = (x[:, None] + self.offset * wi).reshape(-1, 3)
         hit = self.intersect(RayBatch(origins, directions))
         radiance, distance = torch.zeros_like(directions), torch.full_like(directions[:, 0], torch.inf)
-        distance[hit.rows] = (hit.position - origins[hit.rows]).norm(dim=-1)
+        distance[hit.rows] = (hit.position - x[hit.rows // wi.shape[1]]).norm(dim=-1)
         outside = torch.nonzero(hit.outside)[:, 0]
         for part in outside.split(RADIANCE_AT_ONCE):
             rows, position = hit.rows[part], hit.position[part]

@@ -289,9 +289,8 @@ class SurfaceProxy(nn.Module):
         position = start[rows] + traced.distance[rows, None] * directions[rows]
         radiance = torch.zeros_like(directions)
         radiance[rows] = self._outgoing(position, -directions[rows])
-        origin = x[:, None].expand_as(wi).reshape(-1, 3)[rows]
         distance = torch.full_like(directions[:, 0], torch.inf)
-        distance[rows] = (position - origin).norm(dim=-1)
+        distance[rows] = (position - x[rows // wi.shape[1]]).norm(dim=-1)
         return SceneLight(traced.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()

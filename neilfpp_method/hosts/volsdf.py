@@ -190,7 +190,8 @@ class VolSdfHost(nn.Module):
         radiance[rows] = self.radiance_field(
             points, -directions[rows], safe_normalize(surface.gradient), surface.feature
         )
-        distance = torch.where(traced.hit, traced.distance, torch.inf)
+        distance = torch.full_like(traced.distance, torch.inf)
+        distance[rows] = (points - x[rows // wi.shape[1]]).norm(dim=-1)
         return SceneLight(traced.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()

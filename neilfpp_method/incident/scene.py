@@ -53,14 +53,14 @@ def scene_light(
     x = x.detach()
     if isinstance(host, TracesLight):
         return host.scene_light(x, wi)
-    start = (x[:, None] + offset * wi).reshape(-1, 3)
+    points = x[:, None].expand_as(wi).reshape(-1, 3)
     radiance, distance = [], []
-    for origins, directions in zip(
-        start.split(RAYS_AT_ONCE), wi.reshape(-1, 3).split(RAYS_AT_ONCE), strict=True
+    for point, direction in zip(
+        points.split(RAYS_AT_ONCE), wi.reshape(-1, 3).split(RAYS_AT_ONCE), strict=True
     ):
-        hits = host.render(RayBatch(origins, directions))
+        hits = host.render(RayBatch(point + offset * direction, direction))
         hit = hits.is_hit(hit_share)
-        distance.append(torch.where(hit, (hits.position - origins).norm(dim=-1), torch.inf))
+        distance.append(torch.where(hit, (hits.position - point).norm(dim=-1), torch.inf))
         radiance.append(torch.where(hit[:, None], hits.color, 0.0))
     distance = torch.cat(distance).view(wi.shape[:2])
     return SceneLight(distance.isfinite(), torch.cat(radiance).view(wi.shape), distance)

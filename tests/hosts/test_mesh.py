@@ -277,9 +277,8 @@ def test_only_outsides_send_light_and_distances_are_returned():
     assert met.hit.tolist() == [[True, True, False], [True, False, False]]
     sent = [[1.0, 3.0, 0.0], [0.0, 0.0, 0.0]]
     torch.testing.assert_close(met.radiance, torch.tensor(sent)[..., None].expand(2, 3, 3))
-    # Rays start at a small offset, which the distance does not include.
-    near = 0.25 - host.offset
-    expected = torch.tensor([[near, near, math.inf], [near, math.inf, math.inf]])
+    # Rays start at a small offset from x, but distances are measured from x.
+    expected = torch.tensor([[0.25, 0.25, math.inf], [0.25, math.inf, math.inf]])
     torch.testing.assert_close(met.distance, expected)
 
 
