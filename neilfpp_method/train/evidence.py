@@ -65,7 +65,7 @@ def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
         with timed("light_fits", undivided=True):
             evidence = solver.solve(run.model.brdf, run.model.scene)
         lamps = run.model.lamps.count
-        note_fit(run.fits, evidence, lamps, step)
+        note_fit(run.fits, evidence, lamps, step + 1)
         _report(run, record_lamps(run.plan, evidence, lamps, step + 1))
     _share_light(run)
 

@@ -23,7 +23,7 @@ class LightFit:
     """The result of a fit of the light with and without lamps.
 
     Attributes:
-        step: the training step.
+        step: number of steps trained before the fit.
         gain: reduction of the mean relative error by lamps, at points held back from the fit.
         deviation: standard error of that mean.
         points: number of held-back points.
@@ -50,13 +50,17 @@ def write_fits(run: Path, fits: Sequence[LightFit]) -> None:
 
 
 def read_fits(run: Path, before: int) -> list[LightFit]:
-    """Read the results of the fits before a step; empty if none compared the light with and without lamps.
+    """Read the results of the fits; empty if none compared the light with and without lamps.
+
+    Args:
+        run: the run folder.
+        before: number of steps up to which fits are wanted.
 
     Raises:
         UserError: if the file is damaged or of another version.
     """
     fits = read_entries(run / FILE, FORMAT, "fits", LightFit) or []
-    return [fit for fit in fits if fit.step < before]
+    return [fit for fit in fits if fit.step <= before]
 
 
 def light_summary(config: FreeLightConfig | MapLightConfig, fits: Sequence[LightFit]) -> str:

@@ -72,7 +72,7 @@ def test_an_exported_map_is_used_and_then_not_needed(capture, tmp_path, capfd):
     assert f"light: {light_summary(mapped_config().light, record)}" in said
     assert [fit.step for fit in record] == sorted({fit.step for fit in record})
     assert len(record) >= 3
-    assert read_fits(first, before=record[1].step) == record[:1]
+    assert read_fits(first, before=record[1].step - 1) == record[:1]
 
     sky = export_map(first)
     assert read_image(sky).pixels.shape == (6, 12, 3)
@@ -172,3 +172,10 @@ def test_the_record_is_plain_json(tmp_path):
     assert stored["format"] == 1
     assert stored["fits"][0] == dataclasses.asdict(FITS[0])
     assert read_fits(tmp_path, before=101) == FITS
+
+
+def test_the_initial_light_remains_in_the_record_of_a_resumed_run(tmp_path):
+    """The initial light is fitted at the end of a stage, just before the checkpoint of the same step."""
+    write_fits(tmp_path, FITS)
+    assert read_fits(tmp_path, before=FITS[0].step) == FITS[:1]
+    assert read_fits(tmp_path, before=FITS[1].step) == FITS
