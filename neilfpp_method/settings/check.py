@@ -16,8 +16,8 @@ COUNTS = {
     "volume": ("samples",),
 }
 """Settings that are at least 1, by group."""
-SHARES = {"shading": ("hit_share",), "brdf": ("initial_base_color", "initial_metallic")}
-"""Settings between 0 and 1, by group."""
+INITIAL_VALUES = ("initial_base_color", "initial_metallic")
+"""Settings of `brdf` between 0 and 1, without these bounds: the sigmoid of the field does not reach them."""
 MAX_SEED = 2**32 - 1
 """Largest seed. The seed of a step is a multiple of it (`seed_step`) that must fit into 64 bits."""
 
@@ -49,9 +49,9 @@ def _check_ranges(config: NeilfConfig) -> None:
         for name in names:
             _require(getattr(getattr(config, group), name) >= 1, config, group, name, "1 or more")
     _require(0 <= config.train.seed <= MAX_SEED, config, "train", "seed", f"0 to {MAX_SEED}")
-    for group, names in SHARES.items():
-        for name in names:
-            _require(0 <= getattr(getattr(config, group), name) <= 1, config, group, name, "0 to 1")
+    _require(0 <= config.shading.hit_share <= 1, config, "shading", "hit_share", "0 to 1")
+    for name in INITIAL_VALUES:
+        _require(0 < getattr(config.brdf, name) < 1, config, "brdf", name, "a number above 0 and below 1")
     for name in ("radius", "beta_init"):
         value = getattr(config.volume, name)
         _require(0 < value < math.inf, config, "volume", name, "a number above 0")

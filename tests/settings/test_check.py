@@ -32,6 +32,18 @@ WRONG = {
     "a negative seed": (preset("fast"), "train", {"seed": -1}, "train.seed is -1; set it to 0 to 4294967295"),
     "a seed beyond 32 bits": (preset("fast"), "train", {"seed": 2**32}, "train.seed is 4294967296"),
     "more than the whole weight": (preset("fast"), "shading", {"hit_share": 1.5}, "hit-share is 1.5"),
+    "a base colour that no weights have": (
+        preset("fast"),
+        "brdf",
+        {"initial_base_color": 1.0},
+        "initial-base-color is 1.0; set it to a number above 0 and below 1",
+    ),
+    "a metallic that no weights have": (
+        preset("fast"),
+        "brdf",
+        {"initial_metallic": 0.0},
+        "initial-metallic is 0.0",
+    ),
     "a rate that climbs": (
         preset("fast"),
         "optimizer",
