@@ -14,6 +14,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.projection import pixel_index, project
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
+from neilfpp_method.shading.color import CLIPPED
 from neilfpp_method.structures import Indexable, PixelBatch, RayBatch
 
 __all__ = ["Sightings", "TrainingViews"]
@@ -83,7 +84,7 @@ class TrainingViews:
                 break
             view = self.pixels.view(i, gradients=False)
             index = pixel_index(project(self.cameras[i], position[rows]), self.cameras[i])
-            usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < 1).all(-1))
+            usable = (view.mask > 0.5) & self.pixels.valid(i) & (self.hdr | (view.color < CLIPPED).all(-1))
             to_camera = self.centers[i] - position[rows]
             distance = to_camera.norm(dim=-1)
             direction = to_camera / distance[:, None]

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from neilfpp_method.fields.direction_map import texels_of
-from neilfpp_method.shading.color import luminance, srgb_to_linear
+from neilfpp_method.shading.color import CLIPPED, luminance, srgb_to_linear
 
 __all__ = ["KnownSky", "SkySightings"]
 
@@ -84,7 +84,7 @@ class SkySightings(nn.Module):
         """Add the pixels of rays that pass the scene; `color` is in the response of the capture."""
         clipped = torch.zeros_like(color[:, 0])
         if self.response == "srgb":
-            clipped, color = (color >= 1).any(-1).to(color.dtype), srgb_to_linear(color)
+            clipped, color = (color >= CLIPPED).any(-1).to(color.dtype), srgb_to_linear(color)
         texel = texels_of(directions, *self.pixels.shape)
         self.radiance.view(3, -1).index_add_(1, texel, color.t())
         self.squares.view(-1).index_add_(0, texel, luminance(color).square())

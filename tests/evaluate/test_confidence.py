@@ -29,6 +29,7 @@ from neilfpp_method.evaluate.sightings import TrainingViews
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.shading.color import linear_to_srgb
 from neilfpp_method.structures import RayBatch, SurfaceHits
 from neilfpp_method.train.run import Run
 from tests.data.make_capture import RADIUS, SCALE, make_capture
@@ -93,6 +94,19 @@ def test_a_view_sees_the_part_of_a_sphere_that_faces_it(run: Run, mode: str):
     assert torch.equal(seen.wo[~seen.visible], normal[:, None].expand_as(seen.wo)[~seen.visible])
     assert not seen.pixel[~seen.visible].any()
     assert (seen.pixel[seen.visible] > 0).any(-1).all()
+
+
+def test_clipped_pixels_are_not_used(run: Run, monkeypatch):
+    """Also those of a reduced image, whose pixels are averaged and encoded again, with rounding below 1."""
+    views, normal = TrainingViews(run.capture), on_sphere(50)
+    white, view = linear_to_srgb(torch.tensor(1.0)), views.pixels.view
+    monkeypatch.setattr(views, "hdr", False)
+    monkeypatch.setattr(
+        views.pixels,
+        "view",
+        lambda *given, **named: replace(view(*given, **named), color=white.expand(72 * 96, 3)),
+    )
+    assert not views.sightings(run.model, SPHERE * normal, normal, len(views.cameras)).visible.any()
 
 
 def test_the_first_views_are_far_from_one_another(run: Run):

@@ -51,10 +51,12 @@ def test_near_objects_lower_the_weight():
     assert sky.known().weight[sky.pixels > 30].mean() == pytest.approx(expected, rel=0.15)
 
 
-def test_a_clipped_pixel_makes_its_texel_unseen():
+@pytest.mark.parametrize("white", [1.0, linear_to_srgb(torch.tensor(1.0)).item(), 253 / 255])
+def test_a_clipped_pixel_makes_its_texel_unseen(white):
+    """Also in a reduced image, whose pixels are averaged and encoded again, with rounding below 1."""
     sky, wi = SkySightings(HEIGHT, "srgb"), looks(5000)
     color = torch.full((len(wi), 3), 0.5)
-    color[wi[:, 2] > 0.5, 0] = 1.0
+    color[wi[:, 2] > 0.5, 0] = white
     sky.remember(wi, color)
     up = map_directions(HEIGHT, 2 * HEIGHT)[..., 2]
     weight = sky.known().weight
