@@ -145,8 +145,8 @@ EFFECTS: Mapping[str, Effect] = {
                 _free_light("a light that is free at every point is not a map")(config) or _given_map(config)
             ),
             cost=lambda config: (
-                f"{config.shading.train_samples * config.train.rays} map look-ups a step, half of them in "
-                f"directions drawn from the map, and fits of {2 * config.light.environment_height**2} texels"
+                f"{config.shading.train_samples * config.train.rays} map look-ups a step, and fits of "
+                f"{2 * config.light.environment_height**2} texels"
                 if _is_map(config)
                 else ""
             ),

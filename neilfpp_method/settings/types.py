@@ -233,8 +233,8 @@ class ShadingConfig:
     """Whether surfaces reflect specularly. If False, they are Lambertian, without roughness and metallic."""
     sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"
     """Sampling of incident directions. fibonacci: the paper's lattice. cosine: by cosine. lobe: by the
-    specular lobe. mis: cosine, lobe and (for an environment map) light, combined by the balance heuristic.
-    no_lobe: cosine and light.
+    specular lobe. mis: by the light and the lobe, combined by the balance heuristic. no_lobe: by the light.
+    The light is sampled if it is an environment map; otherwise cosine takes its place.
     """
     train_samples: int = 128
     """Incident directions per surface point in training."""
