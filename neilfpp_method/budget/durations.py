@@ -18,7 +18,7 @@ def read_duration(text: str) -> float:
     """Parse a duration into seconds.
 
     Raises:
-        UserError: if the text is no duration, or if it is 0 or longer than `MAX_HOURS`.
+        UserError: if the text is not a duration, or if it is 0 or longer than `MAX_HOURS`.
 
     >>> read_duration("90s"), read_duration("10m"), read_duration("1h30m")
     (90.0, 600.0, 5400.0)

@@ -22,7 +22,7 @@ UNPARSED = re.compile(
     r"|invalid literal for int\(\) with base 10: (?P<whole>.*)"
     r"|could not convert string to float: (?P<real>.*))"
 )
-"""Tyro's messages about values that are no numbers."""
+"""Tyro's messages about values that are not numbers."""
 NUMBERS = {"INT": "a whole number", "FLOAT": "a number"}
 """Tyro's names of the types of single numbers, and what they are called in messages."""
 TYRO_UNKNOWN = "Unrecognized options:"

@@ -68,8 +68,8 @@ def find_brackets(folder: Path, exposures: Path | None = None, unreadable: Colle
     for name, group in groups.items():
         if not _is_bracket(group, exposure_of):
             raise UserError(
-                f"{folder}: the {len(group)} images of '{name}' are no bracket: their exposures do not all "
-                "differ",
+                f"{folder}: the {len(group)} images of '{name}' are not a bracket: their exposures do not "
+                "all differ",
                 f"put each pose in a folder of its own, or list the poses in {GROUPS}",
             )
     return {

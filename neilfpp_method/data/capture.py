@@ -243,7 +243,7 @@ def _recognize(root: Path) -> str:
 
 
 def refuse_run(root: Path) -> None:
-    """Raise a `UserError` if the folder is that of a run, whose pictures are no photographs of a scene."""
+    """Raise a `UserError` if the folder is that of a run, whose pictures are not photographs of a scene."""
     if (root / "config.json").is_file() and (root / "capture.json").is_file():
         raise UserError(f"{root}: a run folder, not a capture", "give the folder that the run was trained on")
 

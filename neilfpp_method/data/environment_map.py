@@ -27,8 +27,8 @@ def check_environment(path: Path) -> None:
     """Check that the header of a file is that of an environment map, without reading its pixels.
 
     Raises:
-        UserError: the file does not exist, is no EXR file, or is smaller than 4×8 or larger than 2048×4096
-            texels.
+        UserError: the file does not exist, is not an EXR file, or is smaller than 4×8 or larger than
+            2048×4096 texels.
     """
     if path.suffix.lower() != ".exr":
         raise UserError(f"{path}: an environment map is linear radiance in an EXR file", "convert it to EXR")

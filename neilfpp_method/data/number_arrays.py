@@ -1,8 +1,8 @@
 """Read arrays of numbers from NPY and NPZ files of untrusted sources.
 
 NumPy allocates the memory that a header asks for, raises many types of exceptions for damaged headers, and
-gives the raw bytes of a member of an archive that is no array. Here every array must have as many bytes as
-its header says, before it is made.
+returns the raw bytes of a member of an archive that is not an array. This module makes an array only if the
+file has as many bytes as its header says.
 """
 
 from __future__ import annotations

@@ -67,7 +67,7 @@ def _axes(line: bytes) -> dict[bytes, int]:
     """The axes of a file and their lengths, the slow one first: {b"-Y": 480, b"+X": 640} for `-Y 480 +X 640`.
 
     Raises:
-        ValueError: the line is no size.
+        ValueError: the line is not a size.
     """
     slow, rows, fast, columns = line.split()
     if {slow[:1], fast[:1]} - {b"+", b"-"} or {slow[1:], fast[1:]} != {b"X", b"Y"}:

@@ -59,7 +59,7 @@ def tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 
 
 def _page(file: tifffile.TiffFile) -> tifffile.TiffPage:
-    """The first page that is no reduced copy of another: a thumbnail may come before the image."""
+    """The first page that is not a reduced copy of another: a thumbnail may come before the image."""
     return next((page for page in file.pages if not page.is_reduced), file.pages[0])
 
 

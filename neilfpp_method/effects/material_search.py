@@ -51,7 +51,7 @@ MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
 MIN_CHANGE = 0.5
 """A material replaces that of the field only if its metallic is lower by at least this much. Smaller
-differences, and those of roughness alone, are no local optima, and the field is more exact than the grid.
+differences, and those of roughness alone, are not local optima, and the field is more exact than the grid.
 """
 MIN_LOSS = 0.005
 """Loss of the field below which its material is kept: that of relative errors of 3 %, which the steps of the
@@ -98,7 +98,7 @@ def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
 def is_search_time(model: NeilfModel, position: StagePosition) -> bool:
     """Whether materials can be compared after `position.step` steps of a stage.
 
-    They never are if the light is no environment map, or if the settings leave out highlights.
+    They never are if the light is not an environment map, or if the settings leave out highlights.
     """
     if model.lobe is None or not isinstance(model.light, EnvironmentLight):
         return False

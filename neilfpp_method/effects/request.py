@@ -90,7 +90,7 @@ def check_effects(request: EffectRequest, config: NeilfConfig) -> None:
 
 
 def _unknown(word: str, what: str) -> UserError:
-    """The error for a word that is no name, with the most similar name as the remedy."""
+    """The error for a word that is not a name, with the most similar name as the remedy."""
     near = get_close_matches(word, EFFECTS, n=1)
     remedy = (
         f"did you mean '{near[0]}'?"

@@ -42,7 +42,7 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     volume = run.config.volume
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = run.device
-    # Stay inside the sphere that may close the scene, which is no surface of the object. Parts outside the
+    # Stay inside the sphere that may close the scene, which is not part of the object. Parts outside the
     # box are removed below.
     radius = min(float(corner), volume.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)

@@ -135,7 +135,7 @@ def shading_normals(
 def _extract(run: Run, resolution: int) -> ExtractedSurface:
     host = run.model.host
     assert isinstance(host, HasSdf)
-    # Stay inside the sphere that may close the scene, which is no surface of the object.
+    # Stay inside the sphere that may close the scene, which is not part of the object.
     mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=run.device)
     return ExtractedSurface(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32))
 

@@ -104,7 +104,7 @@ def cos_edges(
     """Cosines of the polar angles that bound the rows of a map.
 
     The result is kept, because training draws directions within texels in every step. Do not change it. It
-    is no inference tensor, so that later calls can be differentiated.
+    is not an inference tensor, so that later calls can be differentiated.
 
     Args:
         height: number of rows.

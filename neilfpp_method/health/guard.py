@@ -74,7 +74,7 @@ class StepGuard:
         if not self._judged:
             self._judged, self._is_finite = True, self._judge()
         if not self._is_finite:
-            # Others lose theirs before their own steps: until then a GradScaler reads them.
+            # Only the gradients of this optimizer: a GradScaler reads those of another one before its step.
             optimizer.zero_grad(set_to_none=True)
 
     def _judge(self) -> bool:

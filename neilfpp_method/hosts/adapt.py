@@ -58,7 +58,7 @@ def _is_nerfstudio(host: object) -> bool:
 
 
 def _check_wrapper(host: object) -> None:
-    """Check that a host is no wrapper, as of data-parallel training, that hides the methods of a host.
+    """Check that a host is not a wrapper, as of data-parallel training, that hides the methods of a host.
 
     Called as a function, it would be rendered by its `forward`, and never trained with the material.
 

@@ -79,7 +79,8 @@ def image_hits(
         normal = depth_normals(position.view(*size, 3), rays.origins[0])
     solid = opacity.detach().reshape(-1) > SOLID
     unit = safe_normalize(normal.reshape(-1, 3)) * solid[:, None]
-    hit = solid & (unit.detach().norm(dim=-1) > SOLID)
+    has_normal = unit.detach().norm(dim=-1) > 0.5  # the length is 1, or 0 where no normal is known
+    hit = solid & has_normal
     concentration = opacity.detach().reshape(-1) * hit
     return SurfaceHits(
         color=color.reshape(-1, 3),

@@ -75,7 +75,7 @@ class Transport:
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
     def arriving(self, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "K N 3"]:
-        """Sum over the sources at this strength, plus the scene, before it is multiplied by base colors."""
+        """Sum over the sources at this strength, plus the scene, before it is multiplied by base colours."""
         return _SumOverSources.apply(self.sources, strength) + self.scene
 
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:

@@ -127,7 +127,8 @@ def _lights(request: RelightRequest, run: Run, say: Callable[[str], None]) -> di
     if not request.env:
         if not isinstance(run.model.light, EnvironmentLight):
             raise UserError(
-                f"{run.path}: the light of this run is no environment map", "give a map with --env MAP.exr"
+                f"{run.path}: the light of this run is not an environment map",
+                "give a map with --env MAP.exr",
             )
         sky = sky_of_run(run.model.light)
         start = float(sky.start - np.radians(request.rotate))

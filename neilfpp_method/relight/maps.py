@@ -41,7 +41,7 @@ def check_map(path: Path) -> None:
     """Check from the header of a file that it can be an environment map, without reading pixels.
 
     Raises:
-        UserError: the file does not exist, is no image, or has the wrong aspect ratio.
+        UserError: the file does not exist, is not an image, or has the wrong aspect ratio.
     """
     header = image_header(path)
     if not MIN_ROWS <= header.height <= MAX_ROWS:
@@ -52,7 +52,7 @@ def check_map(path: Path) -> None:
     # A map with rows at both poles may have one row more than half of its columns.
     if abs(header.width - 2 * header.height) > 2:
         raise UserError(
-            f"{path}: {header.width}×{header.height} pixels are no latitude-longitude map",
+            f"{path}: {header.width}×{header.height} pixels are not a latitude-longitude map",
             "give a map with twice as many columns as rows",
         )
 

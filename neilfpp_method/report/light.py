@@ -30,7 +30,7 @@ class MapPicture:
 def picture_of_map(run: Run) -> MapPicture | None:
     """Draw the environment map.
 
-    Returns None if the run's light is no environment map, or no stage has estimated the light yet.
+    Returns None if the run's light is not an environment map, or no stage has estimated the light yet.
     """
     light = run.model.light
     if not run.has_material or not isinstance(light, EnvironmentLight):

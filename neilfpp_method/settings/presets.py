@@ -320,7 +320,7 @@ PAPER_MESH: Mapping[str, Any] = {
 
 
 def as_published_on_a_mesh(config: NeilfConfig) -> NeilfConfig:
-    """Apply the settings that the published run on given geometry changes, colored light among them."""
+    """Apply the settings that the published run on given geometry changes, coloured light among them."""
     published = dict(PAPER_MESH)
     if isinstance(config.encoding, FrequencyConfig):
         published |= {name: 2e-3 / SINE_FREQUENCY for name in ("optimizer.brdf", "optimizer.light")}

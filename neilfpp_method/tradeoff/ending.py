@@ -24,7 +24,8 @@ class Ending:
 
     Attributes:
         left_out: why the run has no result; empty if it has one.
-        too_small: if its budget was too small for this machine, the largest one that is, in seconds; else 0.
+        too_small: the largest budget that is known to be too small for this machine, in seconds; 0 if the
+            budget of the run was large enough.
     """
 
     left_out: str = ""

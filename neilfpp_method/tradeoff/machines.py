@@ -30,7 +30,7 @@ def parse_devices(text: str) -> tuple[str, ...]:
         return devices
     for device in devices:
         if not re.fullmatch(r"cpu|cuda:\d+", device):
-            raise UserError(f"--device {text}: '{device}' is no single device", "use cuda:0,cuda:1")
+            raise UserError(f"--device {text}: '{device}' is not a single device", "use cuda:0,cuda:1")
     gpus = [device for device in devices if device != "cpu"]
     if gpus and len(gpus) < len(devices):
         raise UserError(
@@ -78,7 +78,7 @@ def parse_slurm(text: str) -> dict[str, object]:
     for entry in text.split(","):
         name, equals, value = (part.strip() for part in entry.partition("="))
         if not (name and equals and value):
-            raise UserError(f"--slurm {text}: '{entry}' is no NAME=VALUE", "use --slurm partition=gpu")
+            raise UserError(f"--slurm {text}: '{entry}' is not NAME=VALUE", "use --slurm partition=gpu")
         name = name.replace("-", "_")
         if name in found:
             raise UserError(f"--slurm {text}: {name} occurs twice", "give it once")

@@ -36,7 +36,7 @@ the metrics and relit views. `--slurm timeout_min=N` replaces this.
 SHARED = ("timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node", "name", "stderr_to_stdout")
 """Parameters that submitit has for all clusters."""
 SUBMITIT = ("setup", "teardown", "srun_args", "use_srun", "signal_delay_s")
-"""Parameters of submitit for Slurm that are no options of sbatch."""
+"""Parameters of submitit for Slurm that are not options of sbatch."""
 STOPPED = "stopped; the same command continues it"
 
 Work = Callable[[PlannedRun, str, Report | None], Ending]

@@ -40,7 +40,7 @@ effects that they would decide stay as in the settings.
 LIGHT_SHARE = 0.2
 """Share of the budget that the search for the initial light may take; it uses as many places as fit."""
 GUESSED_BUDGET = 5
-"""The budget that is proposed if one passed before any trial was finished, as a multiple of it."""
+"""Ratio of the proposed budget to one that passed before the first trial was finished."""
 LONG_TAILS = "long-tails"
 """The effect that is decided together with the initial light."""
 
@@ -50,8 +50,8 @@ class BudgetTooSmall(UserError):
 
     Args:
         problem, remedy: as for `UserError`.
-        needed: seconds that the smallest useful training takes after the trial; larger budgets below it are
-            too small, too, because the work that is fitted into a budget grows with it.
+        needed: seconds of the smallest useful training, without the trial. All budgets below it are too
+            small, since a larger budget has no less work that is independent of the number of steps.
     """
 
     def __init__(self, problem: str, remedy: str, needed: float) -> None:

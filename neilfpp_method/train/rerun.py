@@ -55,7 +55,7 @@ def rerun_step(run: Path, step: int) -> Rerun:
     """Run a skipped step again on the CPU, with the same random numbers.
 
     Raises:
-        UserError: if the folder is no run, or if it has not stored this step.
+        UserError: if the folder is not a run, or if it has not stored this step.
     """
     described, skipped = read_description(run), load_step(run, step)
     plan = read_plan(run, described.config, step)

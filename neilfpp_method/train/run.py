@@ -240,7 +240,7 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
         checkpoint: "last", or the name of a stage for the weights at its end.
 
     Raises:
-        UserError: if the folder is no run, or a run of another version or without this checkpoint.
+        UserError: if the folder is not a run, or a run of another version or without this checkpoint.
     """
     path = Path(path)
     described = read_description(path)
@@ -273,7 +273,7 @@ def read_description(path: Path) -> Description:
     """Read the description of a run.
 
     Raises:
-        UserError: if the folder is no run, a run of another version, or has a damaged file.
+        UserError: if the folder is not a run, a run of another version, or has a damaged file.
     """
     if not (path / "config.json").is_file():
         missing = (

@@ -88,8 +88,8 @@ def bad_folder(root: Path, kind: str) -> None:
     ("kind", "complaint"),
     [
         ("two sizes", r"a_1\.png: another size than a_0\.png"),
-        ("same exposure", "are no bracket"),
-        ("one image", "are no bracket"),
+        ("same exposure", "are not a bracket"),
+        ("one image", "are not a bracket"),
         ("no exif", r"a_1\.png: no exposure time"),
         ("leaves the folder", "not a path within"),
         ("missing", r"brackets\.json: there is no .*b\.png"),

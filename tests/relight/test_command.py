@@ -360,7 +360,7 @@ def test_an_invalid_map_is_refused(found, tmp_path, capfd, value, word):
 
 
 def test_a_free_light_needs_a_map(given, capfd):
-    refused(capfd, given, words=("no environment map", "--env"))
+    refused(capfd, given, words=("not an environment map", "--env"))
 
 
 def test_a_folder_that_cannot_be_written(found, sky, tmp_path, capfd):

@@ -212,7 +212,9 @@ def focal_of_angle(entry: Entry, size: int) -> float:
     """
     angle = entry.number()
     if not 0 < angle < np.pi:
-        raise UserError(f"{entry.where}: {angle:g} is no angle of view", "give radians, above 0 and below π")
+        raise UserError(
+            f"{entry.where}: {angle:g} is not an angle of view", "give radians, above 0 and below π"
+        )
     return size / (2 * np.tan(angle / 2))
 
 
@@ -220,7 +222,7 @@ def pose_from_opengl(entry: Entry) -> Float64[np.ndarray, "4 4"]:
     """Convert a rigid pose from camera to world with OpenGL axes into world to camera with OpenCV axes.
 
     Raises:
-        UserError: the entry is no 4×4 or 3×4 matrix of a rotation and a translation.
+        UserError: the entry is not a 4×4 or 3×4 matrix of a rotation and a translation.
     """
     c2w = entry.numbers((4, 4), (3, 4))[:3]
     rotation = c2w[:, :3] * FLIP[:3]

@@ -78,6 +78,6 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps(content | {"frames": [content["frames"][0] | {"file_path": "../../secret"}]}))
     refused(tmp_path / "capture", "secret: not a path within the capture")
     path.write_text(json.dumps(content | {"camera_angle_x": 4.0}))
-    refused(tmp_path / "capture", "transforms_test.json: camera_angle_x: 4 is no angle of view")
+    refused(tmp_path / "capture", "transforms_test.json: camera_angle_x: 4 is not an angle of view")
     path.write_text(json.dumps(content | {"frames": [content["frames"][0] | {"file_path": "test/0009"}]}))
     refused(tmp_path / "capture", "there is no", "test/0009")

@@ -57,7 +57,7 @@ def test_cameras_masks_and_splits(tmp_path: Path) -> None:
         ("cam_transform_mat", "1,0,0", "cam_transform_mat: not 16 finite numbers"),
         ("cam_transform_mat", ",".join(["1"] * 16), "not a rotation and a translation"),
         ("cam_transform_mat", None, "cam_transform_mat: not a word"),
-        ("cam_angle_x", 40, "cam_angle_x: 40 is no angle of view"),
+        ("cam_angle_x", 40, "cam_angle_x: 40 is not an angle of view"),
     ],
 )
 def test_bad_metadata_is_refused(tmp_path: Path, entry: str, value: object, complaint: str) -> None:

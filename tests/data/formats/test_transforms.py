@@ -182,7 +182,7 @@ def test_an_impossible_angle_of_view_beside_a_focal_length_is_refused(
     scene(tmp_path)
     edit(tmp_path, lambda c: (c["frames"][1] if in_frame else c).update(camera_angle_x=angle, fl_x=30.0))
     place = "frames.1.camera_angle_x" if in_frame else "camera_angle_x"
-    refused(tmp_path, f"transforms.json: {place}: {angle:g} is no angle of view", "radians")
+    refused(tmp_path, f"transforms.json: {place}: {angle:g} is not an angle of view", "radians")
 
 
 # ------------------------------------------------------------------------------------------- files and splits
