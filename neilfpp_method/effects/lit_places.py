@@ -15,12 +15,12 @@ from neilfpp_method.effects.material_grid import (
     best_materials,
     mean_loss,
     neighbors,
-    outgoing_radiance,
     relative_error,
 )
 from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.layered_transport import layers_at, light_layers
+from neilfpp_method.lighting.transport import outgoing_radiance
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material
 
@@ -48,19 +48,19 @@ class LitPlaces:
 
     Attributes:
         places: the places with their pixels, in linear radiance.
-        arriving: the parts of outgoing radiance of each pixel (`lighting.layered_transport`).
+        parts: the parts of L_o of each pixel under that light (`lighting.layered_transport`).
         near: indices of the neighbours of each place, including itself.
         typical: radiance of a typical pixel.
     """
 
     places: Places
-    arriving: Float[Tensor, "K N 3"]
+    parts: Float[Tensor, "K N 3"]
     near: Int[Tensor, "P M"]
     typical: float
 
     def where(self, rows: Int[Tensor, " R"]) -> LitPlaces:
         """The same places with only some of the pixels."""
-        return LitPlaces(self.places.where(rows), self.arriving[:, rows], self.near, self.typical)
+        return LitPlaces(self.places.where(rows), self.parts[:, rows], self.near, self.typical)
 
     def hold_back(self, fold: int, folds: int) -> tuple[LitPlaces, LitPlaces]:
         """Known and held-back pixels: one fold of the views, numbered from 0 to `folds` − 1, is held back."""
@@ -69,15 +69,14 @@ class LitPlaces:
 
     def best(self, metallics: range) -> BestMaterials:
         """The material of each place that explains the pixels best, such as the best `PAINT`."""
-        return best_materials(self.arriving, self.places, self.typical, metallics, self.near)
+        return best_materials(self.parts, self.places, self.typical, metallics, self.near)
 
     def error(self, material: Material) -> Float[Tensor, "N 3"]:
         """Relative error of each pixel if the places have this material, with roughness of the grid."""
         grid = torch.tensor(ROUGHNESSES, device=self.near.device).log()
         number = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)
-        sent = layers_at(self.arriving, number[self.places.place])
-        pixel = material[self.places.place]
-        outgoing = outgoing_radiance(sent, pixel.base_color, pixel.metallic)
+        parts = layers_at(self.parts, number[self.places.place])
+        outgoing = outgoing_radiance(parts, material[self.places.place])
         return relative_error(outgoing, self.places, self.typical)
 
     def mean_errors(self, material: Material) -> Float[Tensor, " P"]:

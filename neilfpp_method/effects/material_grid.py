@@ -22,7 +22,6 @@ __all__ = [
     "mean_loss",
     "neighbors",
     "on_grid",
-    "outgoing_radiance",
     "relative_error",
 ]
 
@@ -84,15 +83,6 @@ def neighbors(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"
     return torch.cdist(features, features).topk(count, largest=False).indices
 
 
-def outgoing_radiance(
-    sent: Float[Tensor, "3 N 3"], base_color: Float[Tensor, "N 3"], metallic: Float[Tensor, "N 1"]
-) -> Float[Tensor, "N 3"]:
-    """Outgoing radiance from the diffuse, facing and grazing parts (see `lighting.transport`)."""
-    diffuse, facing, grazing = sent
-    reflectance = 0.04 * (1 - metallic) + base_color * metallic
-    return (1 - metallic) * base_color * diffuse + reflectance * facing + grazing
-
-
 def relative_error(outgoing: Float[Tensor, "N 3"], places: Places, typical: float) -> Float[Tensor, "N 3"]:
     """Error of rendered pixels relative to the recorded ones."""
     pixel = places.observed.pixel
@@ -101,7 +91,7 @@ def relative_error(outgoing: Float[Tensor, "N 3"], places: Places, typical: floa
 
 @torch.no_grad()
 def best_materials(
-    arriving: Float[Tensor, "K N 3"],
+    parts: Float[Tensor, "K N 3"],
     places: Places,
     typical: float,
     metallics: range,
@@ -114,18 +104,18 @@ def best_materials(
     and its neighbours is chosen.
 
     Args:
-        arriving: the parts of outgoing radiance under the light (`lighting.layered_transport`).
+        parts: the parts of L_o of each pixel under the light (`lighting.layered_transport`).
         places: the places with their pixels, in linear radiance.
         typical: radiance of a typical pixel.
         metallics: indices in `METALLICS` of the values that are tried.
         near: indices of the neighbours of each place, including itself (`neighbors`).
     """
-    diffuse, unit = arriving[0], places.observed.pixel + FLOOR * typical
+    diffuse, unit = parts[0], places.observed.pixel + FLOOR * typical
     first = torch.zeros(places.count, dtype=torch.long, device=unit.device)
     base_color = torch.full((places.count, 3), MIN_BASE_COLOR, device=unit.device)
     best = BestMaterials(base_color, first, first, torch.full_like(base_color[:, 0], torch.inf))
     for k in range(len(ROUGHNESSES)):
-        facing, grazing = arriving[1 + 2 * k], arriving[2 + 2 * k]
+        facing, grazing = parts[1 + 2 * k], parts[2 + 2 * k]
         for j in metallics:
             m = METALLICS[j]
             # The relative error of a pixel is base_color · slope − target.

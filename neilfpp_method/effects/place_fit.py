@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -23,7 +23,6 @@ from neilfpp_method.effects.material_grid import (
     best_materials,
     neighbors,
     on_grid,
-    outgoing_radiance,
     relative_error,
 )
 from neilfpp_method.effects.place_data import ROWS, PlaceData
@@ -132,9 +131,9 @@ def fit_places(
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS
         fit = _better_light(fit, data, permitted, steps)
-        sent = [part.float() @ fit.radiance for part in data.transport.sources]
-        arriving = torch.stack(sent) + data.transport.scene
-        best = best_materials(arriving, places, data.typical, metallics, near)
+        from_map = [part.float() @ fit.radiance for part in data.transport.sources]
+        parts = torch.stack(from_map) + data.transport.scene
+        best = best_materials(parts, places, data.typical, metallics, near)
         fit = PlaceFit(fit.log_radiance, best.base_color, best.roughness, best.metallic)
     return fit
 
@@ -154,9 +153,7 @@ def _even_start(data: PlaceData, base_color: float) -> PlaceFit:
 def place_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " N"]:
     """Relative error of each pixel, clipped at 1 and averaged over the channels."""
     place = data.places.place
-    sent = _at_roughness(data.transport, fit.roughness[place]).arriving(fit.radiance)
-    material = fit.material(place)
-    outgoing = outgoing_radiance(sent, material.base_color, material.metallic)
+    outgoing = _at_roughness(data.transport, fit.roughness[place]).outgoing(fit.material(place), fit.radiance)
     return relative_error(outgoing, data.places, data.typical).abs().clamp_max(1).mean(-1)
 
 
@@ -174,7 +171,7 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
     """Improve the light and the base colours by descent, with fixed roughness and metallic."""
     place = data.places.place
     selected = _at_roughness(data.transport, fit.roughness[place])
-    metallic = fit.material(place).metallic
+    material = fit.material(place)
     log_radiance = fit.log_radiance.clone().requires_grad_()
     gain = torch.zeros_like(fit.base_color, requires_grad=True)
     groups = [{"params": [log_radiance], "lr": RATE}, {"params": [gain], "lr": GAIN_RATE}]
@@ -182,8 +179,8 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
     with torch.enable_grad():
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
-            sent = selected.arriving(permitted.form(log_radiance).exp().flatten(1).t())
-            outgoing = outgoing_radiance(sent, base_color.clamp(0, 1)[place], metallic)
+            candidate = replace(material, base_color=base_color.clamp(0, 1)[place])
+            outgoing = selected.outgoing(candidate, permitted.form(log_radiance).exp().flatten(1).t())
             error = relative_error(outgoing, data.places, data.typical)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)

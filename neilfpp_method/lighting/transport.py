@@ -26,7 +26,7 @@ from torch import Tensor
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.structures import Material, Observed
 
-__all__ = ["Transport", "brdf_kernel", "spans"]
+__all__ = ["Transport", "brdf_kernel", "outgoing_radiance", "spans"]
 
 PAIRS_AT_ONCE = 2**18
 """Maximum number of pairs of a point and a direction that are traced at once; it bounds memory."""
@@ -74,21 +74,22 @@ class Transport:
         """A transport without sources, whose `scene` includes these sources at a known strength."""
         return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
 
-    def arriving(self, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "K N 3"]:
-        """Sum over the sources at this strength, plus the scene, before it is multiplied by base colours."""
-        return _SumOverSources.apply(self.sources, strength) + self.scene
-
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
-        """L_o for sources of this strength.
+        """L_o for sources of this strength; see `outgoing_radiance`."""
+        return outgoing_radiance(_SumOverSources.apply(self.sources, strength) + self.scene, material)
 
-        Only base colour and metallic of `material` are read; the roughness is part of the transport.
-        """
-        diffuse, *reflected = self.arriving(strength)
-        color = diffuse_reflectance(material, bool(reflected)) * diffuse
-        if reflected:
-            facing, grazing = reflected
-            color = color + normal_reflectance(material) * facing + grazing
-        return color
+
+def outgoing_radiance(parts: Float[Tensor, "K N 3"], material: Material) -> Float[Tensor, "N 3"]:
+    """L_o from its diffuse, facing and grazing parts, or from the diffuse part of Lambertian surfaces.
+
+    Only base colour and metallic of `material` are read; the roughness is contained in the parts.
+    """
+    diffuse, *reflected = parts
+    color = diffuse_reflectance(material, bool(reflected)) * diffuse
+    if reflected:
+        facing, grazing = reflected
+        color = color + normal_reflectance(material) * facing + grazing
+    return color
 
 
 class _SumOverSources(torch.autograd.Function):
