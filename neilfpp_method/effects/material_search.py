@@ -35,8 +35,8 @@ __all__ = [
     "SEARCH_SHARE",
     "SearchedMaterial",
     "found_in",
+    "is_comparison_due",
     "is_search_due",
-    "is_search_time",
     "search_materials",
     "teach",
 ]
@@ -91,12 +91,12 @@ class SearchedMaterial:
 
 
 def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
-    """Whether materials are searched after `position.step` steps of a stage: only if there are metals."""
-    return model.brdf.metals and is_search_time(model, position)
+    """Whether paint is searched for among metals after `position.step` steps of a stage."""
+    return model.brdf.metals and is_comparison_due(model, position)
 
 
-def is_search_time(model: NeilfModel, position: StagePosition) -> bool:
-    """Whether materials can be compared after `position.step` steps of a stage.
+def is_comparison_due(model: NeilfModel, position: StagePosition) -> bool:
+    """Whether materials are compared after `position.step` steps: by a search, or a review of metals.
 
     They never are if the light is not an environment map, or if the settings leave out highlights.
     """

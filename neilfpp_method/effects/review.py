@@ -200,7 +200,7 @@ def review_metals(plan: Plan, model: NeilfModel, places: Places, step: int) -> l
 
     Args:
         plan: the plan to which the decision is added.
-        model: its light is an environment map; see `material_search.is_search_time`.
+        model: its light is an environment map; see `material_search.is_comparison_due`.
         places: places in the training views, with linear radiance.
         step: number of steps trained so far.
 

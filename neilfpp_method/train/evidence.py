@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.material_search import is_search_time
+from neilfpp_method.effects.material_search import is_comparison_due
 from neilfpp_method.effects.places import Places
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.poses import next_motion
@@ -53,6 +53,11 @@ def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
     """Pass a step to the light solver, which fits the light when that is due.
 
     The first process does this for all.
+
+    Args:
+        run: the training.
+        computed: the result of the step.
+        step: index of the step in all stages.
     """
     fabric, solver = run.fabric, run.light_solver
     if fabric.is_global_zero:
@@ -146,7 +151,7 @@ def search_material(run: Training, position: StagePosition, step: int) -> None:
     Both may train the BRDF field. The first process does this for all.
     """
     model, max_pixels = run.model, _max_light_pixels(run)
-    if max_pixels < MIN_PIXELS or not is_search_time(model, position):
+    if max_pixels < MIN_PIXELS or not is_comparison_due(model, position):
         return
     if not (model.brdf.metals or run.plan.is_open("metals")):
         return
