@@ -63,8 +63,7 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
             masks, only points inside them are used.
 
     Raises:
-        UserError: a camera is malformed, a mask cannot be read, or the extent of the scene cannot be
-            determined.
+        UserError: a camera is malformed, or the extent of the scene cannot be determined.
     """
     for view in views:
         check_camera(view.camera, str(view.image))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,6 +16,7 @@ from neilfpp_method.data.camera import scaled_camera
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.projection import Projection, pixel_index, project
 from neilfpp_method.data.views import View
+from neilfpp_method.errors import UserError
 
 __all__ = [
     "AGREEMENT",
@@ -62,18 +64,17 @@ def read_outlines(
     cameras of the returned views have the size of the silhouettes.
 
     Returns:
-        The silhouettes; an empty list if fewer than half of the chosen views have a mask.
-
-    Raises:
-        UserError: a mask cannot be read.
+        The silhouettes; an empty list if fewer than half of the chosen views have a mask. Files that cannot
+        be read are left out: a training refuses them, and `neilfpp inspect` names them.
     """
     chosen = views[:: -(-len(views) // max_views)]
     outlines = []
     for view in chosen:
-        image = read_image(view.mask or view.image)
-        values = image.alpha if view.mask is None else image.mask
-        if values is not None:
-            outlines.append(outline_of(view, values > 0.5, max_side))
+        with suppress(UserError):
+            image = read_image(view.mask or view.image)
+            values = image.alpha if view.mask is None else image.mask
+            if values is not None:
+                outlines.append(outline_of(view, values > 0.5, max_side))
     return outlines if len(outlines) >= len(chosen) / 2 else []
 
 

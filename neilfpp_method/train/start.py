@@ -79,9 +79,6 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
 
     Returns:
         The initial shape; None if the host has no distance field to initialise (a mesh or a borrowed host).
-
-    Raises:
-        UserError: if a mask cannot be read.
     """
     if not isinstance(model.host, VolSdfHost):
         return None

@@ -118,6 +118,14 @@ def test_a_mask_of_nothing_has_no_influence(tmp_path: Path) -> None:
     assert find_box(masked).source == "cameras"
 
 
+def test_a_damaged_mask_has_no_influence(tmp_path: Path) -> None:
+    """`neilfpp inspect` has to load the capture, or else it could name only the first damaged file."""
+    masked = views(tmp_path, masks=True)
+    expected = find_box([*masked[:3], *masked[4:]])
+    masked[3].mask.write_bytes(masked[3].mask.read_bytes()[:60])
+    assert find_box(masked).normalization.scale == pytest.approx(expected.normalization.scale, rel=1e-6)
+
+
 def test_cameras_that_look_in_one_direction_or_apart_are_refused(tmp_path: Path) -> None:
     first, second, *_ = views(tmp_path)
     with pytest.raises(UserError, match="look in one direction"):
