@@ -14,11 +14,17 @@ from jaxtyping import Float64
 from neilfpp_method.data.lens import Lens
 from neilfpp_method.errors import UserError
 
-__all__ = ["Camera", "check_camera", "scaled_camera"]
+__all__ = ["POSE_MISTAKES", "Camera", "check_camera", "scaled_camera"]
 
 MIN_FOCAL, LARGEST = 1e-3, 1e12
 """Smallest focal length, in pixels, and largest absolute value of any number of a camera, so that rays can be
 computed in float32."""
+
+POSE_MISTAKES = (
+    "the axes may be of another convention (OpenCV: y down, z forward; OpenGL: y up, z back), or the poses "
+    "inverted (world to camera)"
+)
+"""Common mistakes in the poses of all cameras, for the remedy of an error."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from neilfpp_method.data.camera import check_camera
+from neilfpp_method.data.camera import POSE_MISTAKES, check_camera
 from neilfpp_method.data.focus import axes_of, find_focus, meeting_point
 from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement, read_outlines
 from neilfpp_method.data.views import Normalization, SceneSource, View
@@ -136,7 +136,8 @@ def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalization:
         raise UserError(
             f"{where}: the cameras look away from one another, as on a tripod that turns, so the position of "
             "the scene is unknown",
-            "take photographs from several sides of the object, or add points or a scene box",
+            "take photographs from several sides of the object, or add points or a scene box; if they are "
+            f"from several sides, {POSE_MISTAKES}",
         )
     radius = float(np.median(depth * half)) * fill
     return Normalization(radius, (float(center[0]), float(center[1]), float(center[2])))

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from neilfpp_method.data.camera import POSE_MISTAKES
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.inverted_masks import look_inverted
 from neilfpp_method.data.point_cloud import load_point_cloud
@@ -270,7 +271,8 @@ def _camera_defects(capture: Capture, placement: CameraPlacement) -> Iterator[De
     names = np.array([view.name for view in capture.views])
     if placement.away.any():
         text = "the cameras look away: the centre of the scene is not in the picture"
-        remedy = "check the poses and the scene box, or leave these views out"
+        remedy = "check the poses and the scene box"
+        remedy += f": {POSE_MISTAKES}" if placement.away.mean() > 0.5 else ", or leave these views out"
         yield Defect("looking_away", "problem", text, remedy, tuple(names[placement.away]))
     if placement.within.any():
         text = "these cameras are inside the unit sphere, which should contain only the object"

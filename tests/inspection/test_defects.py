@@ -98,6 +98,16 @@ def test_a_camera_that_looks_away(capture: Capture) -> None:
     (line,) = problems_of_poses(replace(capture, views=views))  # what `neilfpp train` prints, without a pixel
     assert line.startswith("problem: the cameras look away")
     assert view.name in line
+    assert "leave these views out" in line
+
+
+def test_cameras_with_the_axes_of_opengl(capture: Capture) -> None:
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    flipped = [replace(v, camera=replace(v.camera, w2c=flip @ v.camera.w2c)) for v in capture.views]
+    (line,) = problems_of_poses(replace(capture, views=tuple(flipped)))
+    assert "the cameras look away" in line
+    assert "OpenGL: y up, z back" in line
+    assert "leave these views out" not in line
     assert problems_of_poses(capture) == ()
 
 
