@@ -280,9 +280,10 @@ def _check_views(views: Sequence[View]) -> bool:
     for view in views:
         _check_view(view)
         if view.name in by_name:
-            raise UserError(
-                f"{view.image} and {by_name[view.name].image} have the same name", "rename one of them"
-            )
+            other = by_name[view.name].image
+            if view.image == other:
+                raise UserError(f"{other}: listed twice", "list it once")
+            raise UserError(f"{view.image} and {other} have the same name", "rename one of them")
         by_name[view.name] = view
         by_kind.setdefault(_checked_header(view).hdr, view)
     if len(by_kind) > 1:

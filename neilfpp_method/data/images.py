@@ -26,7 +26,15 @@ from neilfpp_method.data.radiance_hdr import hdr_header, hdr_samples
 from neilfpp_method.data.tiff import tiff_header, tiff_samples
 from neilfpp_method.errors import UserError
 
-__all__ = ["IMAGE_SUFFIXES", "ImageFile", "image_header", "read_image", "write_exr", "write_png"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "UNREAD_SUFFIXES",
+    "ImageFile",
+    "image_header",
+    "read_image",
+    "write_exr",
+    "write_png",
+]
 
 MAX_SIDE = 65_536
 """Longest side of an image, in pixels."""
@@ -123,6 +131,8 @@ FORMATS: Mapping[str, Format] = {
 }
 """The formats by the suffix of a file, in small letters."""
 IMAGE_SUFFIXES = tuple(FORMATS)
+UNREAD_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".webp", ".bmp")
+"""Suffixes of photographs in formats that are not read."""
 FULL_SCALE = {"uint8": 255.0, "uint16": 65_535.0, "float16": 1.0, "float32": 1.0, "float64": 1.0}
 """Sample that becomes 1, by the type of the samples."""
 

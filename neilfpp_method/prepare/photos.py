@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32
 from PIL import Image
 
 from neilfpp_method.data.formats.places import view_names
-from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header, read_image
+from neilfpp_method.data.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_header, read_image
 from neilfpp_method.data.paths import plain_name
 from neilfpp_method.data.photo_exposure import photo_exposure
 from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
@@ -36,9 +36,6 @@ MIN_PHOTOS = 3
 EXIF_FOLDER, MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x0112, 0x920A, 0xA405
 """EXIF tags: the sub-directory of exposure data, manufacturer, model, orientation, focal length in
 millimetres, and the equivalent focal length on 35 mm film."""
-
-OTHER_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".jp2", ".webp", ".bmp")
-"""Suffixes of photographs in formats that are not read. They count as unreadable instead of being skipped."""
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Suffixes of videos, which are skipped."""
@@ -174,7 +171,8 @@ def read_photo(path: Path) -> DecodedPhoto:
 
 def _is_photo(path: Path, root: Path) -> bool:
     hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
-    suffixes = (*IMAGE_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
+    # Photographs in formats that are not read count as unreadable instead of being skipped.
+    suffixes = (*IMAGE_SUFFIXES, *RAW_SUFFIXES, *UNREAD_SUFFIXES)
     return not hidden and path.suffix.lower() in suffixes and path.is_file()
 
 

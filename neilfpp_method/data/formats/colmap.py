@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.colmap_library import pycolmap
 from neilfpp_method.data.formats.colmap_sizes import check_sizes
-from neilfpp_method.data.formats.places import check_masks, stored, stored_image, view_names
+from neilfpp_method.data.formats.places import check_masks, stored, stored_images, view_names
 from neilfpp_method.data.lens import PANORAMAS, lens_of
 from neilfpp_method.data.paths import inside
 from neilfpp_method.data.point_cloud import read_positions
@@ -75,9 +75,10 @@ def read(root: Path) -> CaptureFiles:
             f"{root}: there is no images/{first}", "put the images of the model into the folder images"
         )
     masks = next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), root / MASK_FOLDERS[0])
+    files = stored_images(root, [inputs / name for name in names], str(folder))
     views = []
-    for index, (image, listed, name) in enumerate(zip(registered, names, view_names(names), strict=True)):
-        file = stored_image(root, inputs / listed, f"{folder}: {listed}")
+    described = zip(registered, names, view_names(names), files, strict=True)
+    for index, (image, listed, name, file) in enumerate(described):
         w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
         views.append(View(name, index, camera, file, _mask(masks, root, listed)))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
-from neilfpp_method.data.images import IMAGE_SUFFIXES
+from neilfpp_method.data.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES
 from neilfpp_method.data.paths import inside
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 
-__all__ = ["check_masks", "stored", "stored_image", "view_names"]
+__all__ = ["check_masks", "stored", "stored_image", "stored_images", "view_names"]
 
 
 def stored(root: Path, path: Path) -> Path | None:
@@ -23,7 +23,7 @@ def stored(root: Path, path: Path) -> Path | None:
     """
     if inside(root, path).is_file():
         return path
-    base = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    base = _without_suffix(path)
     candidates = [base.with_name(base.name + suffix) for suffix in IMAGE_SUFFIXES]
     existing = [inside(root, file) for file in candidates if file.is_file()] or _upper_case(root, base)
     if len(existing) > 1:
@@ -32,23 +32,43 @@ def stored(root: Path, path: Path) -> Path | None:
     return existing[0] if existing else None
 
 
+def _without_suffix(path: Path) -> Path:
+    return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+
+
 def _upper_case(root: Path, base: Path) -> list[Path]:
     """The images with this name and a suffix of any case, such as IMG_7.JPG; found by listing the folder."""
+    return [inside(root, file) for file in _named(base, IMAGE_SUFFIXES)]
+
+
+def _named(base: Path, suffixes: Collection[str]) -> list[Path]:
+    """The files with this name and one of the suffixes, in any case."""
     if not base.parent.is_dir():
         return []
-    return [
-        inside(root, file)
-        for file in sorted(base.parent.iterdir())
-        if file.stem == base.name and file.suffix.lower() in IMAGE_SUFFIXES
-    ]
+    files = sorted(base.parent.iterdir())
+    return [file for file in files if file.stem == base.name and file.suffix.lower() in suffixes]
 
 
 def stored_image(root: Path, path: Path, where: str) -> Path:
     """As `stored`, but a missing file is a `UserError`; `where` names the entry that lists it."""
-    image = stored(root, path)
-    if image is None:
-        raise UserError(f"{where}: there is no {path}", "put the image there, or correct the path")
+    (image,) = stored_images(root, [path], where)
     return image
+
+
+def stored_images(root: Path, paths: Sequence[Path], where: str) -> tuple[Path, ...]:
+    """As `stored_image` for all images that `where` lists; the error tells how many are missing."""
+    images = [stored(root, path) for path in paths]
+    missing = [path for path, image in zip(paths, images, strict=True) if image is None]
+    if missing:
+        problem = f"{where}: there is no {missing[0]}"
+        remedy = "put the image there, correct the path, or remove the entry"
+        for unread in _named(_without_suffix(missing[0]), UNREAD_SUFFIXES):
+            problem += f", only {unread.name}, whose format is not read"
+            remedy = "convert it to PNG or JPEG"
+        if len(missing) > 1:
+            problem += f" ({len(missing)} of {len(paths)} images are missing)"
+        raise UserError(problem, remedy)
+    return tuple(image for image in images if image is not None)
 
 
 def check_masks(folder: Path, views: Sequence[View]) -> None:

@@ -30,7 +30,7 @@ from jaxtyping import Float64
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.capture_folder import read_scene
 from neilfpp_method.data.formats.nerfstudio_lens import COEFFICIENTS, FISHEYE, lens_from_nerfstudio
-from neilfpp_method.data.formats.places import stored, stored_image, view_names
+from neilfpp_method.data.formats.places import stored, stored_image, stored_images, view_names
 from neilfpp_method.data.images import image_header
 from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.paths import inside
@@ -125,16 +125,17 @@ def read_frames(root: Path, entry: Entry) -> tuple[Frame, ...]:
     frames = entry["frames"].items()
     if not frames:
         raise UserError(f"{entry.where}: no frames", "export the cameras again")
-    return tuple(_frame(root, entry, frame) for frame in frames)
+    listed = [frame["file_path"].text() for frame in frames]
+    images = stored_images(root, [root / name for name in listed], entry.where)
+    described = zip(frames, listed, images, strict=True)
+    return tuple(_frame(root, entry, frame, name, image) for frame, name, image in described)
 
 
-def _frame(root: Path, entry: Entry, frame: Entry) -> Frame:
-    listed = frame["file_path"]
-    image = _named(root, listed)
+def _frame(root: Path, entry: Entry, frame: Entry, listed: str, image: Path) -> Frame:
     mask, valid = (
         _named(root, path) if (path := frame.get(name)) else None for name in ("mask_path", "valid_path")
     )
-    return Frame(listed.text(), image, mask, valid, _camera(entry, frame, image))
+    return Frame(listed, image, mask, valid, _camera(entry, frame, image))
 
 
 def _named(root: Path, listed: Entry) -> Path:

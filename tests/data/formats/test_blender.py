@@ -81,3 +81,14 @@ def test_bad_files_are_refused(tmp_path: Path) -> None:
     refused(tmp_path / "capture", "transforms_test.json: camera_angle_x: 4 is not an angle of view")
     path.write_text(json.dumps(content | {"frames": [content["frames"][0] | {"file_path": "test/0009"}]}))
     refused(tmp_path / "capture", "there is no", "test/0009")
+
+
+def test_missing_images_are_counted(tmp_path: Path) -> None:
+    root = scene(tmp_path / "capture")
+    files = sorted((root / "train").iterdir())
+    for file in files[1:]:
+        file.unlink()
+    missing, listed = len(files) - 1, len(json.loads((root / "transforms_train.json").read_text())["frames"])
+    refused(root, f"({missing} of {listed} images are missing)", "remove the entry")
+    (root / "train" / f"{files[1].stem}.webp").touch()
+    refused(root, f"only {files[1].stem}.webp, whose format is not read", "convert it")

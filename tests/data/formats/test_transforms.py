@@ -249,7 +249,10 @@ def frame(content: dict) -> dict:
         (lambda c: c["frames"].append(3), ["frames.6: not a JSON object"]),
         (lambda c: frame(c).pop("file_path"), ["frames.2.file_path is missing"]),
         (lambda c: frame(c).update(file_path=7), ["frames.2.file_path: not a file name"]),
-        (lambda c: frame(c).update(file_path="images/x.png"), ["frames.2.file_path: there is no", "x.png"]),
+        (
+            lambda c: frame(c).update(file_path="images/x.png"),
+            ["transforms.json: there is no", "images/x.png; put the image there"],
+        ),
         (lambda c: frame(c).update(file_path="../secret.exr"), ["secret.exr: not a path within the capture"]),
         (lambda c: frame(c).update(file_path="/etc/hostname"), ["hostname: not a path within the capture"]),
         (lambda c: frame(c).update(mask_path="../secret.exr"), ["secret.exr: not a path within the capture"]),
@@ -285,7 +288,7 @@ def frame(content: dict) -> dict:
             lambda c: c.update(k5=0.1, camera_model="OPENCV_FISHEYE"),
             ["k5 is not supported for the camera model OPENCV_FISHEYE"],
         ),
-        (lambda c: c["frames"].append(frame(c)), ["have the same name"]),
+        (lambda c: c["frames"].append(frame(c)), ["002.exr: listed twice", "list it once"]),
     ],
 )
 def test_bad_entries_are_refused(tmp_path: Path, change: Callable[[dict], object], words: list[str]) -> None:
