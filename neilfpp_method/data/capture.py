@@ -146,7 +146,7 @@ class Capture:
         names = {view.name: (view,) for view in self.views}
         for word in words:
             if word in groups and not groups[word]:
-                raise UserError(f"{self.root}: there is no {word} view", "give all, or names of views")
+                raise UserError(f"{self.root}: there is no {word} view", "give --views all")
             if word not in groups and word not in names:
                 remedy = f"give test, train, all, or names of views, such as {self.views[0].name}"
                 raise UserError(f"{self.root}: there is no view '{word}'", remedy)

@@ -10,7 +10,7 @@ from neilfpp_method.data.paths import inside
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
 
-__all__ = ["check_test_every", "every_kth", "held_out_views"]
+__all__ = ["TEST_EVERY", "check_test_every", "every_kth", "held_out_views"]
 
 FILE = "split.json"
 """File of a capture with the names or numbers of its test views."""

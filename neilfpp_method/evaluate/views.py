@@ -13,6 +13,7 @@ from torch import Tensor
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.data.projection import camera_rays, pixel_index, project
+from neilfpp_method.data.split import TEST_EVERY
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
@@ -95,7 +96,10 @@ def render_test_views(
     """
     held_out = [i for i, view in enumerate(run.capture.views) if view.name in run.capture.test]
     if not held_out:
-        raise UserError(f"{run.capture.root}: no view is held out for testing", "train with --test-every 8")
+        every = min(TEST_EVERY, len(run.capture.views))
+        raise UserError(
+            f"{run.capture.root}: no view is held out for testing", f"train with --test-every {every}"
+        )
     rendered = []
     for i in held_out:
         rendered.append(

@@ -144,5 +144,5 @@ def test_a_run_without_a_name_is_named_after_its_capture(capture, tmp_path, monk
 def test_a_group_without_views_is_refused(capture, group):
     loaded = load_capture(capture)
     chosen = frozenset() if group == "test" else frozenset(view.name for view in loaded.views)
-    with pytest.raises(UserError, match=f"there is no {group} view; give all"):
+    with pytest.raises(UserError, match=f"there is no {group} view; give --views all"):
         replace(loaded, test=chosen).chosen_views([group])

@@ -223,8 +223,11 @@ def test_true_depth_selects_the_pixels_otherwise_the_masks(captures, tmp_path):
 
 
 def test_a_capture_without_test_views_is_refused(captures):
+    loaded = load_capture(captures.hdr, test_every=0)
     with pytest.raises(UserError, match="no view is held out"):
-        evaluate(make_run(load_capture(captures.hdr, test_every=0)))
+        evaluate(make_run(loaded))
+    with pytest.raises(UserError, match="train with --test-every 3"):
+        evaluate(make_run(dataclasses.replace(loaded, views=loaded.views[:3])))
 
 
 def test_images_smaller_than_the_window_have_no_ssim(tmp_path):
