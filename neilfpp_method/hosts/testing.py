@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.hosts.adapt import adapt
 from neilfpp_method.hosts.base import HasStages, Host
-from neilfpp_method.hosts.function import CallableHost, RenderFunction
 from neilfpp_method.hosts.outputs import check_normals, host_name
 from neilfpp_method.hosts.testing_case import HIT_SHARE, Case, ContractBroken, Modes, render_checked
 from neilfpp_method.hosts.testing_conduct import BASIC_CHECKS, CONDUCT_CHECKS
@@ -50,25 +50,29 @@ class HostReport:
     trains_geometry: bool
 
 
-def check_host(
-    host: Host | RenderFunction, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None
-) -> HostReport:
+def check_host(host: object, rays: RayBatch, parameters: Sequence[nn.Parameter] | None = None) -> HostReport:
     """Check that a host keeps the contract of `hosts.base.Host`.
 
     Args:
-        host: the host, or a function (origins, directions) → (color, position, normal). Its train/eval mode
-            is not changed.
+        host: what `attach_neilf` accepts, if it renders rays: a host, or a function (origins, directions) →
+            (color, position, normal). Its train/eval mode is not changed.
         rays: some hundred rays in the scene frame, from outside of the object; several must hit it.
         parameters: the parameters that the host trains; if None, all its parameters, if it is a module.
 
     Raises:
         ContractBroken: the host breaks the contract (an AssertionError that names the host and the defect).
+        UserError: it is no host, or draws whole images instead of rays.
 
     Example:
         >>> print(check_host(my_function, RayBatch(origins, directions)))
     """
     modules = [part for part in (host, getattr(host, "__self__", None)) if isinstance(part, nn.Module)]
-    host = host if isinstance(host, Host) else CallableHost(host)
+    host = adapt(host, "linear")
+    if not isinstance(host, Host):
+        raise UserError(
+            f"{host_name(host)} draws whole images, and these checks render single rays",
+            "train some steps: losses(batch, step, hits) checks the first ten batches",
+        )
     if parameters is None:
         parameters = [p for module in modules for p in module.parameters()]
     parameters = [p for p in parameters if p.requires_grad]
@@ -78,7 +82,7 @@ def check_host(
     try:
         hits = render_checked(host, rays)
         stages = host.stages if isinstance(host, HasStages) else STAGES
-        trains_geometry = any("geometry" in plan.trains for plan in stages.values())
+        trains_geometry = bool(parameters) and any("geometry" in plan.trains for plan in stages.values())
         hit = hits.is_hit(HIT_SHARE).detach()
         now = partial(Modes.of, modules, parameters)
         case = Case(host, name, before, now, rays, parameters, trains_geometry, hits, hit)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.function import CallableHost
 from neilfpp_method.hosts.testing import CHECKS, check_host
 from neilfpp_method.structures import RayBatch
@@ -35,6 +36,25 @@ def test_a_function_keeps_the_contract():
     assert report.hits == 200
     assert check_host(ball, ball_rays()) == report  # a function is taken as it is
     assert check_host(ball.forward, ball_rays()).hits == 200
+
+
+def test_a_function_without_parameters_trains_no_geometry():
+    ball = Ball()
+    report = check_host(lambda origins, directions: ball(origins, directions), ball_rays(), [])
+    assert not report.trains_geometry
+
+
+class Rasteriser:
+    def render_image(self, camera):
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize(
+    ("host", "message"), [(Rasteriser(), "Rasteriser draws whole images"), (3, "int is not a host")]
+)
+def test_what_cannot_be_checked_is_refused(host, message):
+    with pytest.raises(UserError, match=message):
+        check_host(host, ball_rays())
 
 
 def sideways(rays: RayBatch) -> torch.Tensor:
