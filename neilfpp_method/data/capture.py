@@ -311,7 +311,9 @@ def _checked_header(view: View) -> ImageHeader:
     for path, header in headers.items():
         if (header.width, header.height) != size:
             remedy = "resize the image, or scale its camera"
-            if (header.height, header.width) == size:
+            if path != view.image:
+                remedy = "make the mask again, with the size and orientation of the stored image"
+            elif (header.height, header.width) == size:
                 remedy = "rotate the pixels as the EXIF data of the image states"
             raise UserError(
                 f"{path}: {header.width}×{header.height} pixels where the camera has {size[0]}×{size[1]}",

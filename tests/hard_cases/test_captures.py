@@ -238,7 +238,7 @@ def test_mask_shows_no_object(tmp_path: Path) -> None:
 def test_mask_with_another_size(tmp_path: Path) -> None:
     root = make_capture(tmp_path, masks=True)
     write_png(root / "inputs" / "masks" / "001.png", np.ones((9, 12), np.uint8))
-    refused(root, "masks/001.png: 12×9 pixels where the camera has 24×18")
+    refused(root, "masks/001.png: 12×9 pixels where the camera has 24×18; make the mask again")
 
 
 def test_alpha_shows_no_object(tmp_path: Path) -> None:
