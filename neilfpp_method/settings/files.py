@@ -14,27 +14,37 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["read_settings"]
 
-MAX_BYTES = 1 << 20
-"""Largest size of a settings file, in bytes: hundreds of times that of a file with all settings."""
+MAX_BYTES = 1 << 17
+"""Largest size of a settings file, in bytes: eighty times that of a file with all settings."""
 
 
 class _Loader(yaml.SafeLoader):
     """Loader with plain values as in YAML 1.2: `off`, `on`, `no`, `12:30` are strings and `5e-4` is a number.
 
     YAML 1.1, which PyYAML implements, reads `mode: off` as False and `5e-4` as a string. A name that is set
-    twice in one mapping is an error.
+    twice in one mapping is an error, and so is an alias of a list or a mapping: by aliases of aliases, a few
+    lines describe more values than fit into memory.
     """
 
     yaml_implicit_resolvers: dict[str, list] = {}  # noqa: RUF012 (PyYAML keeps its resolvers in the class)
 
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        event = self.peek_event()
+        node = super().compose_node(parent, index)
+        if isinstance(event, yaml.AliasEvent) and not isinstance(node, yaml.ScalarNode):
+            what = f"'*{event.anchor}' stands for several values; write them here"
+            raise yaml.composer.ComposerError(None, None, what, event.start_mark)
+        return node
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        names: list[Any] = []
+        mapping = super().construct_mapping(node, deep)  # refuses names that cannot be hashed
+        names: set[Hashable] = set()
         for key, _ in node.value:
             name = self.construct_object(key, deep=True)
             if name in names:
                 raise yaml.constructor.ConstructorError(None, None, f"'{name}' is set twice", key.start_mark)
-            names.append(name)
-        return super().construct_mapping(node, deep)
+            names.add(name)
+        return mapping
 
 
 PLAIN_VALUES = {
@@ -66,6 +76,10 @@ def read_settings(path: Path) -> Mapping[str, Any]:
         raise UserError(f"{path}: no such file", "name a settings file with --config") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path}: not a text file", "name a settings file with --config") from error
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be read ({error.strerror})", "name a settings file with --config"
+        ) from error
     try:
         content = json.loads(text) if path.suffix == ".json" else yaml.load(text, Loader=_Loader)
     except json.JSONDecodeError as error:
@@ -73,7 +87,9 @@ def read_settings(path: Path) -> Mapping[str, Any]:
     except yaml.MarkedYAMLError as error:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
         raise UserError(f"{path}{line}: not YAML ({error.problem})", "correct the file") from error
-    except (yaml.YAMLError, RecursionError) as error:
+    except Exception as error:
+        # PyYAML and Python raise many types of exceptions for values that do not fit their tags, for numbers
+        # with thousands of digits and for deep nesting.
         raise UserError(f"{path}: not a settings file", "correct the file") from error
     if content is None:
         return {}

@@ -84,6 +84,14 @@ def test_the_file_of_a_run_folder_gives_its_settings(tmp_path, config):
         ("a.yaml", "preset: quick", "unknown preset 'quick'"),
         ("a.yaml", "preset: 3", "a.yaml.preset: 3 is not a name"),
         ("a.yaml", "x" * (1 << 21), "a.yaml: too large"),
+        ("a.yaml", "train.rays: " + "9" * 5000, "a.yaml: not a settings file"),
+        ("a.json", '{"train.rays": ' + "9" * 5000 + "}", "a.json: not a settings file"),
+        ("a.yaml", "train.rays: !!int many", "a.yaml: not a settings file"),
+        ("a.yaml", "train.rays: !!bool many", "a.yaml: not a settings file"),
+        ("a.yaml", "train.rays: !!timestamp 2001-13-45", "a.yaml: not a settings file"),
+        ("a.yaml", 'host.path: "\\U99999999"', "a.yaml: not a settings file"),
+        ("a.yaml", "[a]: 1", "a.yaml:1: not YAML"),
+        ("a.yaml", "a: &a [1]\nb: *a\n", "a.yaml:2: not YAML ('*a' stands for several values"),
     ],
 )
 def test_invalid_settings_files_are_refused(tmp_path, name, text, complaint):
@@ -96,6 +104,24 @@ def test_invalid_settings_files_are_refused(tmp_path, name, text, complaint):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"none\.yaml: no such file"):
         settings_of("--config", str(tmp_path / "none.yaml"))
+
+
+def test_a_folder_is_refused(tmp_path):
+    (tmp_path / "a.yaml").mkdir()
+    with pytest.raises(UserError, match=r"a\.yaml: cannot be read \(Is a directory\)"):
+        read_settings(tmp_path / "a.yaml")
+
+
+def test_aliases_of_aliases_are_not_expanded(tmp_path):
+    """Ten lines describe 10¹⁰ values, which a message about them would spell out."""
+    levels = [f"b{i}: &b{i} {{{', '.join(f'k{j}: *b{i - 1}' for j in range(10))}}}" for i in range(1, 11)]
+    text = "train: {rays: {b0: &b0 {x: 1}, " + ", ".join(levels) + "}}\n"
+    with pytest.raises(UserError, match=r"'\*b0' stands for several values"):
+        settings_of("--config", str(written(tmp_path, text)))
+
+
+def test_an_alias_may_stand_for_one_value(tmp_path):
+    assert read_settings(written(tmp_path, "a: &a 5e-4\nb: *a\n")) == {"a": 5e-4, "b": 5e-4}
 
 
 def test_a_binary_file_is_refused(tmp_path):
