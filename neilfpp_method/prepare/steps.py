@@ -83,6 +83,6 @@ def _mark(folder: Path, inputs: str, result: dict[str, Any] | None) -> None:
 def _marker(folder: Path) -> dict[str, Any]:
     try:
         marker = json.loads((folder / MARKER).read_text("utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return marker if isinstance(marker, dict) else {}
