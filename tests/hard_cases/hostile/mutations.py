@@ -20,8 +20,8 @@ WORDS = [
     *("NaN", "Infinity", "-Infinity", "null", "true", "[]", "{}", '""', "-1", "0", "1e999", "0.5"),
     *("99999999999", "'", '"', ",", ":", "[", "{", "\\", "\x00", "\n", "\ufeff", "~", "&a", "*a"),
     *("../../../../etc/passwd", "/etc/passwd", "..", '"../../../../etc/passwd"', '"/etc/passwd"'),
-    *("<script>alert(1)</script>", "!!python/object:os.system"),
-    *("9" * 400, "[" * 5000, "x" * 5000),
+    *("<script>alert(1)</script>", "!!python/object:os.system", "!!timestamp 2001-13-45", "!!bool maybe"),
+    *("9" * 400, "9" * 5000, "[" * 5000, "x" * 5000),
 ]
 """What a text may say in the place of a number or a word."""
 
