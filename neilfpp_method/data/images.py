@@ -44,6 +44,8 @@ LABEL = 1.001 / 255
 """Largest value of a mask file, in [0, 1], at which it contains labels instead of brightness: 1 of 255."""
 SIGNATURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
 """First bytes of PNG and JPEG files, which are recognised by them, because renamed files are common."""
+PILLOW_FORMATS = ("PNG", "JPEG")
+"""Formats that Pillow may recognise. It would start Ghostscript for a PostScript file with another suffix."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,7 @@ def _exr_header(path: Path) -> ImageHeader:
 
 
 def _pillow_header(path: Path) -> ImageHeader:
-    with Image.open(path) as image:
+    with Image.open(path, formats=PILLOW_FORMATS) as image:
         return ImageHeader(*image.size, hdr=False)
 
 
@@ -94,7 +96,7 @@ def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 
 
 def _png_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
-    with Image.open(path) as image:
+    with Image.open(path, formats=PILLOW_FORMATS) as image:
         if "transparency" in image.info and image.mode in ("P", "L", "1"):
             # OpenCV ignores the transparent colours of palettes and of grey images.
             return np.asarray(image.convert("RGBA"))
@@ -103,7 +105,7 @@ def _png_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 
 def _jpeg_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
     # Not OpenCV, which silently fills the missing part of a truncated file with grey.
-    with Image.open(path) as image:
+    with Image.open(path, formats=PILLOW_FORMATS) as image:
         return np.atleast_3d(np.asarray(image if image.mode == "L" else image.convert("RGB")))
 
 

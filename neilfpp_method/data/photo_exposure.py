@@ -12,9 +12,13 @@ from PIL import Image
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["LISTS", "exposures_of", "photo_exposure", "read_exposures"]
+__all__ = ["LISTS", "exif_entries", "exposures_of", "photo_exposure", "read_exposures"]
 
 EXIF_FOLDER, TIME, APERTURE, SENSITIVITY = 0x8769, 0x829A, 0x829D, 0x8827
+EXIF_FORMATS = ("JPEG", "PNG", "TIFF")
+"""Formats in which EXIF is looked for; most camera RAW files are TIFF files. For others, Pillow would run
+parsers that nothing here needs.
+"""
 LISTS = ("exposures.json", "exposures.txt")
 WRITE_A_LIST = f"write {LISTS[1]} beside the images: a line 'NAME SECONDS' for each"
 
@@ -48,18 +52,24 @@ def exposures_of(folder: Path, images: Sequence[Path], table: Path | None = None
     return exposures
 
 
+def exif_entries(path: Path) -> tuple[dict, dict]:
+    """Return the EXIF entries of a file and those of its exposure sub-directory; empty if there are none."""
+    try:
+        with Image.open(path, formats=EXIF_FORMATS) as image:
+            exif = image.getexif()
+            return dict(exif), dict(exif.get_ifd(EXIF_FOLDER))
+    except Exception:
+        # Pillow raises many types of exceptions for unknown formats and for damaged EXIF blocks.
+        return {}, {}
+
+
 def photo_exposure(path: Path) -> float | None:
     """Return time · ISO/100 / f-number² from EXIF, time in seconds; None if EXIF has no usable one.
 
     A missing factor counts as 1, because it is constant for a lens or a camera that does not record it. An
     ISO of 0 or an f-number of 0, which adapted lenses write, counts as missing.
     """
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif().get_ifd(EXIF_FOLDER)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        # Pillow cannot open the file.
-        return None
+    _, exif = exif_entries(path)
     time, aperture, sensitivity = (_positive(exif.get(tag)) for tag in (TIME, APERTURE, SENSITIVITY))
     if time is None:
         return None

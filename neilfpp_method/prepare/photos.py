@@ -10,12 +10,11 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32
-from PIL import Image
 
 from neilfpp_method.data.formats.places import view_names
 from neilfpp_method.data.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_header, read_image
 from neilfpp_method.data.paths import plain_name
-from neilfpp_method.data.photo_exposure import photo_exposure
+from neilfpp_method.data.photo_exposure import exif_entries, photo_exposure
 from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
 from neilfpp_method.errors import UserError
 
@@ -33,15 +32,18 @@ __all__ = [
 MIN_PHOTOS = 3
 """Smallest number of photographs with which structure from motion is attempted."""
 
-EXIF_FOLDER, MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x8769, 0x010F, 0x0110, 0x0112, 0x920A, 0xA405
-"""EXIF tags: the sub-directory of exposure data, manufacturer, model, orientation, focal length in
-millimetres, and the equivalent focal length on 35 mm film."""
+MAKE, MODEL, ORIENTATION, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x920A, 0xA405
+"""EXIF tags: manufacturer, model, orientation, focal length in millimetres, and the equivalent focal length
+on 35 mm film."""
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Suffixes of videos, which are skipped."""
 
 FILM_WIDTH = 36.0
 """Longer side of a frame of 35 mm film, in millimetres."""
+
+FOCAL_RANGE = 1.0, 10_000.0
+"""Smallest and largest equivalent focal length that a lens can have, in millimetres; others are ignored."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,8 @@ def check_names(names: Sequence[str], paths: Sequence[Path]) -> None:
 
 
 def _photo(root: Path, name: str, path: Path, linear: bool) -> Photo:
-    entries, details = _exif(path)
+    entries, details = exif_entries(path)
+    low, high = FOCAL_RANGE
     focal_35mm, focal = (_number(details.get(tag)) for tag in (FOCAL_35MM, FOCAL))
     device = " ".join(
         str(part).strip() for part in (entries.get(MAKE), entries.get(MODEL), focal or focal_35mm) if part
@@ -207,20 +210,9 @@ def _photo(root: Path, name: str, path: Path, linear: bool) -> Photo:
         folder=path.parent.relative_to(root).as_posix(),
         exposure=photo_exposure(path) if linear else None,
         device=device,
-        focal=focal_35mm and focal_35mm / FILM_WIDTH,
+        focal=focal_35mm / FILM_WIDTH if focal_35mm and low <= focal_35mm <= high else None,
         orientation=int(_number(entries.get(ORIENTATION)) or 1),
     )
-
-
-def _exif(path: Path) -> tuple[dict, dict]:
-    """The EXIF entries of a file and those of its exposure sub-directory; empty if Pillow finds none."""
-    try:
-        with Image.open(path) as image:
-            exif = image.getexif()
-            return dict(exif), dict(exif.get_ifd(EXIF_FOLDER))
-    except Exception:
-        # Pillow raises many types of exceptions for unknown formats and for damaged EXIF blocks.
-        return {}, {}
 
 
 def _number(entry: object) -> float | None:

@@ -11,7 +11,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import tifffile
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
 from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.images import image_header, read_image, write_exr, write_png
@@ -202,6 +202,21 @@ def test_png_and_jpeg_are_read_by_their_content(tmp_path: Path, suffix: str) -> 
     (tmp_path / f"c{suffix}").write_bytes((tmp_path / "b.jpg").read_bytes()[:-60])
     with pytest.raises(UserError, match="cannot be read"):
         read_image(tmp_path / f"c{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_postscript_under_another_name_starts_no_program(tmp_path: Path, monkeypatch, suffix: str) -> None:
+    """Pillow would start Ghostscript, if there is one on the path, to draw it."""
+    started = tmp_path / "started"
+    (tmp_path / "gs").write_text(f"#!/bin/sh\necho > {started}\n")
+    (tmp_path / "gs").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)  # the result of an earlier search
+    head = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 20 20\n%%EndComments\nshowpage\n%%EOF\n"
+    (tmp_path / f"a{suffix}").write_bytes(head)
+    with pytest.raises(UserError, match="cannot be read"):
+        read_image(tmp_path / f"a{suffix}")
+    assert not started.exists()
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])

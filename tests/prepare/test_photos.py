@@ -46,6 +46,13 @@ def test_names_cameras_and_focal_lengths(tmp_path):
     assert survey(tmp_path, "linear").linear
 
 
+def test_focal_lengths_that_no_lens_has_are_ignored(tmp_path):
+    for i, focal in enumerate((1, 10_000, 10_001)):
+        jpeg(tmp_path / f"{i}.jpg", focal)
+    focals = [photo.focal for photo in survey(tmp_path, "auto").items]
+    assert focals == [pytest.approx(1 / 36), pytest.approx(10_000 / 36), None]
+
+
 def test_exif_gives_the_orientation_of_a_camera(tmp_path):
     for i, orientation in enumerate((None, 6, 8, 99)):
         exif = Image.Exif()
