@@ -18,6 +18,9 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["Mesh", "read_mesh"]
 
+SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb")
+"""Formats that are read, by suffix; trimesh would also unpack archives and run other programs."""
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -31,16 +34,22 @@ def read_mesh(path: Path, normalization: Normalization) -> Mesh:
     """Read a mesh in the world frame and transform it to the scene frame. Equal vertices are not merged.
 
     Raises:
-        UserError: the file does not exist, or has no valid triangles.
+        UserError: the file does not exist, is of another format than PLY, OBJ, STL, OFF or GLB, or has no
+            valid triangles.
     """
     if not path.is_file():
         raise UserError(
             f"{path}: there is no such mesh", "give the path of a triangle mesh, such as a PLY file"
         )
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise UserError(f"{path}: not a format of meshes that is read", f"use one of {', '.join(SUFFIXES)}")
     try:
-        if path.suffix.lower() == ".glb":
+        if suffix == ".glb":
             _check_counts(path)
-        mesh = trimesh.load_mesh(path, process=False)
+        # No other file that the mesh names is opened: there is nothing in this archive.
+        alone = trimesh.resolvers.ZipResolver({})
+        mesh = trimesh.load_mesh(path, resolver=alone, process=False, skip_materials=True)
         # In double precision, because the world's origin may be far away, as in map coordinates.
         vertices = torch.as_tensor(np.array(mesh.vertices), dtype=torch.float64)
         faces = torch.as_tensor(np.array(mesh.faces), dtype=torch.int64)

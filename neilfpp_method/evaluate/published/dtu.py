@@ -186,7 +186,8 @@ def _points(path: Path) -> Float[np.ndarray, "P 3"]:
     if path.stat().st_size > LARGEST_CLOUD:
         raise UserError(f"{path}: larger than 2 GiB", "give the points of the dataset's SampleSet")
     try:
-        points = np.asarray(trimesh.load(path, process=False).vertices, dtype=np.float64)
+        cloud = trimesh.load(path, process=False, skip_materials=True)
+        points = np.asarray(cloud.vertices, dtype=np.float64)
     # A damaged or forged file can raise any exception in the reader.
     except Exception as error:
         raise UserError(f"{path}: cannot be read ({error})", "download the SampleSet again") from error
