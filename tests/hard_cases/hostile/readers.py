@@ -32,6 +32,7 @@ from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.surface_cache import ExtractedSurface, read_surface, write_surface
+from neilfpp_method.prepare.photos import survey
 from neilfpp_method.settings.files import read_settings
 from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import preset
@@ -168,6 +169,27 @@ def _read_photo(folder: Path, damaged: Path) -> None:
     exposure = photo_exposure(damaged)
     assert exposure is None or (np.isfinite(exposure) and exposure > 0)
     _read_image(folder, damaged)
+
+
+def _photographs(folder: Path) -> list[Path]:
+    """Photographs with EXIF; a RAW file of most cameras is a TIFF file."""
+    image = Image.fromarray(_picture(3, np.uint8))
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110], exif[0x0112] = "maker", "model", 6
+    exif.get_ifd(0x8769).update({0x829A: 0.01, 0x829D: 5.6, 0x8827: 200, 0x920A: 35.0, 0xA405: 50})
+    for name in ("a.jpg", "b.png", "c.tif"):
+        image.save(folder / name, exif=exif)
+    (folder / "d.dng").write_bytes((folder / "c.tif").read_bytes())
+    return sorted(folder.iterdir())
+
+
+def _read_photographs(folder: Path, damaged: Path) -> None:
+    photos = survey(folder, "linear")
+    for photo in photos.items:
+        for number in (photo.exposure, photo.focal):
+            assert number is None or (np.isfinite(number) and number > 0)
+    for problem in photos.unreadable.values():
+        raise UserError(problem, "export it again")
 
 
 def _environment(folder: Path) -> list[Path]:
@@ -465,6 +487,7 @@ READERS: Mapping[str, Reader] = {
     "TIFF": Reader(_tiff, _read_image),
     "JPEG": Reader(_jpeg, _read_photo),
     "HDR": Reader(_hdr, _read_image),
+    "photographs (EXIF)": Reader(_photographs, _read_photographs, 0.2),
     "environment map": Reader(_environment, _read_environment),
     "points (PLY)": Reader(_ply, _read_ply),
     "mesh (PLY, OBJ, STL, OFF, GLB)": Reader(_mesh, _read_mesh),
