@@ -11,6 +11,7 @@ from torch import nn
 
 from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.errors import UserError
+from neilfpp_method.train.tensor_file import read_tensor_file
 
 __all__ = [
     "FORMAT",
@@ -65,7 +66,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise UserError(f"{path}: no checkpoint", "train the run first, or continue it with --resume")
     try:
-        contents = torch.load(path, map_location="cpu", weights_only=True)
+        contents = read_tensor_file(path)
     except Exception as error:
         # A damaged or forged file can raise any exception in the unpickler.
         remedy = "copy a stage's checkpoint over it, or train again"

@@ -15,6 +15,7 @@ from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import PixelBatch
+from neilfpp_method.train.tensor_file import read_tensor_file
 
 __all__ = ["FOLDER", "Moment", "SkippedStep", "keep_step", "load_step"]
 
@@ -123,7 +124,7 @@ def load_step(run: Path, step: int) -> SkippedStep:
             remedy = "the run has skipped no step, so there is nothing to replay"
         raise UserError(f"{run}: step {step} is not a stored skipped step", remedy)
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
+        stored = read_tensor_file(path)
     except Exception as error:
         # A damaged or forged file can raise any exception in the unpickler.
         raise UserError(f"{path}: not a readable step", "train again") from error
