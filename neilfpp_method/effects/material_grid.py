@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from neilfpp_method.effects.places import Places
 from neilfpp_method.lighting.objective import FLOOR, OUTLIER
+from neilfpp_method.shading.brdf import DIELECTRIC_F0
 from neilfpp_method.structures import Material
 
 __all__ = [
@@ -120,7 +121,7 @@ def best_materials(
             m = METALLICS[j]
             # The relative error of a pixel is base_color · slope − target.
             slope = ((1 - m) * diffuse + m * facing) / unit
-            target = (places.observed.pixel - 0.04 * (1 - m) * facing - grazing) / unit
+            target = (places.observed.pixel - DIELECTRIC_F0 * (1 - m) * facing - grazing) / unit
             weight = torch.ones_like(slope)
             for _ in range(REWEIGHTED):
                 squares = places.mean(weight * slope.square()).clamp_min(1e-12)

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from neilfpp_method.shading.brdf import DIELECTRIC_F0
 from neilfpp_method.structures import Indexable, Material
 
 __all__ = ["ROUGHNESS_NODES", "Deviation", "Observations", "RadianceParts", "expected_error", "prior_error"]
@@ -176,7 +177,7 @@ class _BaseColor:
 
 def _solve(products: _Products, m: Float[Tensor, " M"]) -> _BaseColor:
     """Solve R − k F = b A for b, with A = (1 − m) D + m F and k = 0.04 (1 − m), b truncated to [0, 1]."""
-    p, k = products, 0.04 * (1 - m)
+    p, k = products, DIELECTRIC_F0 * (1 - m)
     aa = (1 - m).square() * p.dd + 2 * m * (1 - m) * p.df + m.square() * p.ff
     ar = (1 - m) * p.dr + m * p.fr - k * ((1 - m) * p.df + m * p.ff)
     rr = p.rr - 2 * k * p.fr + k.square() * p.ff

@@ -21,6 +21,7 @@ from neilfpp_method.shading.frame import at_least_float32, dot
 from neilfpp_method.structures import Material
 
 __all__ = [
+    "DIELECTRIC_F0",
     "GGX",
     "LOBES",
     "SPHERICAL_GAUSSIAN",
@@ -35,6 +36,9 @@ __all__ = [
     "roughness_floor",
     "specular_terms",
 ]
+
+DIELECTRIC_F0 = 0.04
+"""Reflectance of a dielectric at normal incidence, that of an index of refraction of 1.5."""
 
 
 # ------------------------------------------------------------------------------------------------------ lobes
@@ -192,7 +196,7 @@ def diffuse_reflectance(material: Material, specular: bool = True) -> Float[Tens
 def normal_reflectance(material: Material) -> Float[Tensor, "N 3"]:
     """F0 = 0.04 (1 − m) + b m."""
     base_color, metallic = at_least_float32(material.base_color), material.metallic
-    return 0.04 * (1 - metallic) + base_color * metallic
+    return DIELECTRIC_F0 * (1 - metallic) + base_color * metallic
 
 
 def specular_terms(
