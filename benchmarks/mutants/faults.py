@@ -354,10 +354,10 @@ MUTANTS: Sequence[Mutant] = (
     # Checkpoints.
     Mutant(
         "checkpoints may run code",
-        "train/checkpoint.py",
+        "train/tensor_file.py",
         'map_location="cpu", weights_only=True)',
         'map_location="cpu", weights_only=False)',
-        "train/test_checkpoint.py",
+        "train/test_tensor_file.py",
     ),
     Mutant(
         "checkpoints are written in place",

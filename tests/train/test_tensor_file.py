@@ -46,11 +46,27 @@ class Call:
         return self.function, self.arguments
 
 
+def write_pickle(path: Path, content: object, protocol: int) -> None:
+    """Write a file of `torch.save` with this pickle and no tensors."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a/data.pkl", pickle.dumps(content, protocol))
+        archive.writestr("a/version", "3\n")
+
+
+def test_code_is_not_run(tmp_path: Path) -> None:
+    """From protocol 4 on, a pickle may assemble the name of a function from strings."""
+    crater = tmp_path / "crater"
+    write_pickle(tmp_path / "a.pt", Call(Path.touch, crater), 4)
+    with pytest.raises(pickle.UnpicklingError):
+        read_tensor_file(tmp_path / "a.pt")
+    assert not crater.exists()
+    torch.load(tmp_path / "a.pt", weights_only=False)
+    assert crater.exists()  # pickle itself runs the code
+
+
 @pytest.mark.parametrize("call", [Call(bytearray, 1 << 40), Call(torch.UntypedStorage, 1 << 40)])
 def test_a_call_that_makes_an_array_of_any_size_is_refused(tmp_path: Path, call: Call) -> None:
-    with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
-        archive.writestr("a/data.pkl", pickle.dumps(call, 2))
-        archive.writestr("a/version", "3\n")
+    write_pickle(tmp_path / "a.pt", call, 2)
     with pytest.raises(ValueError, match="it refers to"):
         read_tensor_file(tmp_path / "a.pt")
 
