@@ -276,8 +276,8 @@ def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " 
         width, height = view.camera.width, view.camera.height
         row, left = np.arange(width), np.arange(1, height - 1) * width
         edge = store.starts[i] + np.concatenate([row, (height - 1) * width + row, left, left + width - 1])
-        bits = store.bits[edge]
-        edge = edge[(bits & VALID > 0) & (bits & (KNOWN | MASK) != KNOWN | MASK)]
+        bits, on_object = store.bits[edge], KNOWN | MASK
+        edge = edge[((bits & VALID) > 0) & ((bits & on_object) != on_object)]
         numbers.append(edge)
         views.append(np.full(len(edge), i))
     return np.concatenate(numbers), np.concatenate(views)

@@ -61,7 +61,7 @@ def check_host(host: object, rays: RayBatch, parameters: Sequence[nn.Parameter] 
 
     Raises:
         ContractBroken: the host breaks the contract (an AssertionError that names the host and the defect).
-        UserError: it is no host, or draws whole images instead of rays.
+        UserError: it is not a host, or draws whole images instead of rays.
 
     Example:
         >>> print(check_host(my_function, RayBatch(origins, directions)))

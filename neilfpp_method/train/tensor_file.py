@@ -15,12 +15,14 @@ __all__ = ["read_tensor_file"]
 NAMES = re.compile(
     r"collections OrderedDict|torch\._utils _rebuild_(tensor_v2|parameter)|torch (?!Untyped|Typed)\w+Storage"
 )
-"""What the pickle of tensors and plain values refers to."""
+"""Names to which the pickle of tensors and plain values refers, as "module name"."""
 
 
 def read_tensor_file(path: Path) -> Any:
-    """Read tensors and plain values onto the CPU. A forged file runs no code and takes no more memory than
-    its size: torch would unpack compressed members, and make arrays of bytes of any length that it names.
+    """Read tensors and plain values onto the CPU.
+
+    A forged file runs no code and takes no more memory than its size. `torch.load` alone would unpack
+    compressed members, and would make byte arrays of any length that the file asks for.
 
     Raises:
         Exception: of any type, if the file is damaged or forged.
