@@ -114,6 +114,7 @@ class Capture:
         test: names of the test views.
         point_cloud: oriented point cloud; None if there is none.
         scene_from: where the normalisation comes from.
+        missing: images that the capture lists and that do not exist; they have no view.
     """
 
     root: Path
@@ -125,6 +126,7 @@ class Capture:
     test: frozenset[str]
     point_cloud: Path | None = None
     scene_from: SceneSource = "box"
+    missing: tuple[str, ...] = ()
 
     @property
     def train_views(self) -> tuple[View, ...]:
@@ -159,7 +161,7 @@ class Capture:
 
     @property
     def summary(self) -> str:
-        """The capture in three lines for the console."""
+        """The capture in three lines for the console, and one more if listed images are missing."""
         sizes = sorted({(view.camera.width, view.camera.height) for view in self.views})
         size = f"{sizes[0][0]}×{sizes[0][1]}" if len(sizes) == 1 else f"{len(sizes)} sizes"
         masks = sum(view.mask is not None for view in self.views)
@@ -173,8 +175,16 @@ class Capture:
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
                 f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalization.scale:.4g} "
                 "world units" + BOX_SOURCES[self.scene_from],
+                *self._missing_text(),
             ]
         )
+
+    def _missing_text(self) -> list[str]:
+        if not self.missing:
+            return []
+        listed = len(self.views) + len(self.missing)
+        count = f"{len(self.missing)} of {listed} listed images are missing and left out"
+        return [f"warning: {count}; the first is {self.missing[0]}"]
 
 
 def load_capture(
@@ -220,6 +230,7 @@ def load_capture(
         test=held_out_views(root, files, test_every, test),
         point_cloud=files.point_cloud,
         scene_from=files.scene_from,
+        missing=files.missing,
     )
 
 

@@ -85,6 +85,7 @@ class CaptureFiles:
         test: names of the test views; None if the capture states no split.
         hdr: whether pixels are linear radiance; None if the capture does not state it.
         scene_from: source of the normalisation.
+        missing: images that the description lists and that do not exist; they have no view.
     """
 
     inputs: Path
@@ -94,3 +95,4 @@ class CaptureFiles:
     test: frozenset[str] | None = None
     hdr: bool | None = None
     scene_from: SceneSource = "box"
+    missing: tuple[str, ...] = ()

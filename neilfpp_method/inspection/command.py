@@ -91,6 +91,7 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
             "response": "linear" if capture.hdr else "srgb",
             "views": len(capture.views),
             "test_views": len(capture.test_views),
+            "missing_images": list(capture.missing),
             "masks": sum(view.mask is not None for view in capture.views),
             "validity_masks": sum(view.valid is not None for view in capture.views),
             "point_cloud": capture.point_cloud is not None,

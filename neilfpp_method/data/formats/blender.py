@@ -1,7 +1,8 @@
 """Reader of Blender's transforms_train.json and transforms_test.json (NeRF synthetic, Stanford-ORB).
 
     camera_angle_x               horizontal field of view in radians, for all frames or in a frame
-    frames[].file_path           the image, without suffix: .png with alpha, .exr, …
+    frames[].file_path           the image, without suffix: .png with alpha, .exr, …; frames without one
+                                   are left out
     frames[].transform_matrix    camera to world, 4×4, OpenGL axes (x right, y up, z back)
     <folder>_mask/<name>.png     optional: masks of the images in <folder>; else the alpha channel is the mask
 
@@ -13,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from neilfpp_method.data.formats.places import stored, view_names
-from neilfpp_method.data.formats.transforms import Frame, read_frames
+from neilfpp_method.data.formats.transforms import Frame, Frames, read_frames
 from neilfpp_method.data.json_entry import Entry
 from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scene_box import find_box
@@ -34,19 +35,26 @@ def read(root: Path) -> CaptureFiles:
     """Read the files of the capture: the training views, then the test views.
 
     Raises:
-        UserError: a file is malformed, or names an image that is missing or outside the folder.
+        UserError: a file is malformed, most images are missing, or a path leads out of the folder.
     """
     train = read_frames(root, Entry.load(inside(root, root / LAYOUT)))
     held_out = (root / TEST).is_file()
-    test = read_frames(root, Entry.load(inside(root, root / TEST))) if held_out else ()
-    names = view_names([frame.listed for frame in (*train, *test)])
+    test = read_frames(root, Entry.load(inside(root, root / TEST))) if held_out else Frames((), ())
+    frames = (*train.existing, *test.existing)
+    names = view_names([frame.listed for frame in frames])
     views = tuple(
         View(name, i, frame.camera, frame.image, frame.mask or _mask(root, frame))
-        for i, (name, frame) in enumerate(zip(names, (*train, *test), strict=True))
+        for i, (name, frame) in enumerate(zip(names, frames, strict=True))
     )
     box = find_box(views)
-    split = frozenset(names[len(train) :]) if held_out else None
-    return CaptureFiles(root, views, box.normalization, test=split, scene_from=box.source)
+    return CaptureFiles(
+        inputs=root,
+        views=views,
+        normalization=box.normalization,
+        test=frozenset(names[len(train.existing) :]) if held_out else None,
+        scene_from=box.source,
+        missing=train.missing + test.missing,
+    )
 
 
 def _mask(root: Path, frame: Frame) -> Path | None:

@@ -2,7 +2,8 @@
 
     sparse/0, sparse, … or the folder itself    cameras, images, points3D (.bin or .txt); of several models
                                                   sparse/0, sparse/1, … the largest
-    images/, or beside the model                the images; an EXR file may replace a listed image
+    images/, or beside the model                the images; an EXR file may replace a listed image; images
+                                                  that do not exist are left out
     masks/<image>.png or masks/<stem>.png       optional: masks; the folder may also be called mask
     fused.ply or dense/fused.ply                optional: COLMAP's dense points with normals
     object_point_cloud.ply                      optional: points of the object only, from which the scene box
@@ -13,6 +14,7 @@ Images are used as they are: a lens keeps its distortion, and rays are bent inst
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from glob import escape
 from pathlib import Path
 
@@ -49,11 +51,11 @@ def recognize(root: Path) -> bool:
 
 
 def read(root: Path) -> CaptureFiles:
-    """Read the files of the capture: one view for each registered image, in the order of their names.
+    """Read the files of the capture: one view for each registered image that exists, in the order of names.
 
     Raises:
-        UserError: the model is malformed or empty, has a panorama, or an image is missing or outside the
-            folder.
+        UserError: the model is malformed or empty, has a panorama, most images are missing, or one is outside
+            the folder.
     """
     folder = model_folder(root)
     if folder is None:
@@ -66,9 +68,9 @@ def read(root: Path) -> CaptureFiles:
         raise UserError(f"{folder}: the model has no registered image", "reconstruct the cameras again")
     # A model that was written on Windows may have its separators.
     names = [image.name.replace("\\", "/") for image in registered]
-    first = names[0]
-    inputs = next((root / place for place in IMAGE_FOLDERS if stored(root, root / place / first)), None)
+    inputs = _image_folder(root, names)
     if inputs is None:
+        first = names[0]
         _check_spaces(root, folder, first)
         _check_reduced(root, first)
         raise UserError(
@@ -76,12 +78,14 @@ def read(root: Path) -> CaptureFiles:
         )
     masks = next((root / name for name in MASK_FOLDERS if (root / name).is_dir()), root / MASK_FOLDERS[0])
     files = stored_images(root, [inputs / name for name in names], str(folder))
+    described = tuple(zip(registered, names, files, strict=True))
+    existing = [(image, listed, file) for image, listed, file in described if file]
+    view_name = view_names([listed for _, listed, _ in existing])
     views = []
-    described = zip(registered, names, view_names(names), files, strict=True)
-    for index, (image, listed, name, file) in enumerate(described):
+    for index, (image, listed, file) in enumerate(existing):
         w2c = np.concatenate([image.cam_from_world().matrix(), [[0.0, 0.0, 0.0, 1.0]]])
         camera = camera_of(image.camera, w2c, f"{folder}: {listed}")
-        views.append(View(name, index, camera, file, _mask(masks, root, listed)))
+        views.append(View(view_name[index], index, camera, file, _mask(masks, root, listed)))
     check_masks(masks, views)
     if (root / OBJECT).is_file():
         points = read_positions(inside(root, root / OBJECT))
@@ -89,7 +93,20 @@ def read(root: Path) -> CaptureFiles:
         points = np.array([p.xyz for p in model.points3D.values()]).reshape(-1, 3)
     cloud = next((inside(root, root / place) for place in POINT_CLOUDS if (root / place).is_file()), None)
     box = find_box(views, points[np.isfinite(points).all(axis=1)])
-    return CaptureFiles(inputs, tuple(views), box.normalization, cloud, scene_from=box.source)
+    return CaptureFiles(
+        inputs=inputs,
+        views=tuple(views),
+        normalization=box.normalization,
+        point_cloud=cloud,
+        scene_from=box.source,
+        missing=tuple(listed for _, listed, file in described if file is None),
+    )
+
+
+def _image_folder(root: Path, names: Sequence[str]) -> Path | None:
+    """The first folder that has at least one of the images."""
+    folders = (root / place for place in IMAGE_FOLDERS)
+    return next((folder for folder in folders if any(stored(root, folder / name) for name in names)), None)
 
 
 def open_model(folder: Path) -> pycolmap.Reconstruction:

@@ -12,6 +12,9 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["check_masks", "stored", "stored_image", "stored_images", "view_names"]
 
+MAX_MISSING = 0.5
+"""Largest share of the listed images that may be missing. If more are, the folder is more likely wrong."""
+
 
 def stored(root: Path, path: Path) -> Path | None:
     """Return the file, or the file of the same name with another image suffix; None if neither exists.
@@ -51,24 +54,42 @@ def _named(base: Path, suffixes: Collection[str]) -> list[Path]:
 
 def stored_image(root: Path, path: Path, where: str) -> Path:
     """As `stored`, but a missing file is a `UserError`; `where` names the entry that lists it."""
-    (image,) = stored_images(root, [path], where)
+    image = stored(root, path)
+    if image is None:
+        raise _no_image(path, where)
     return image
 
 
-def stored_images(root: Path, paths: Sequence[Path], where: str) -> tuple[Path, ...]:
-    """As `stored_image` for all images that `where` lists; the error tells how many are missing."""
-    images = [stored(root, path) for path in paths]
+def stored_images(root: Path, paths: Sequence[Path], where: str) -> tuple[Path | None, ...]:
+    """As `stored` for all images that `where` lists.
+
+    Up to `MAX_MISSING` of them may be missing: cameras are often written before images are deleted. Callers
+    leave out their views and report them in `CaptureFiles.missing`.
+
+    Raises:
+        UserError: more are missing, or one is there in a format that is not read.
+    """
+    images = tuple(stored(root, path) for path in paths)
     missing = [path for path, image in zip(paths, images, strict=True) if image is None]
-    if missing:
-        problem = f"{where}: there is no {missing[0]}"
-        remedy = "put the image there, correct the path, or remove the entry"
-        for unread in _named(_without_suffix(missing[0]), UNREAD_SUFFIXES):
-            problem += f", only {unread.name}, whose format is not read"
-            remedy = "convert it to PNG or JPEG"
-        if len(missing) > 1:
-            problem += f" ({len(missing)} of {len(paths)} images are missing)"
-        raise UserError(problem, remedy)
-    return tuple(image for image in images if image is not None)
+    unread = next((path for path in missing if _unread(path)), None)
+    if unread or len(missing) > MAX_MISSING * len(paths):
+        counted = f" ({len(missing)} of {len(paths)} images are missing)" if len(missing) > 1 else ""
+        raise _no_image(unread or missing[0], where, counted)
+    return images
+
+
+def _no_image(path: Path, where: str, counted: str = "") -> UserError:
+    problem = f"{where}: there is no {path}"
+    remedy = "put the image there, correct the path, or remove the entry"
+    for unread in _unread(path):
+        problem += f", only {unread.name}, whose format is not read"
+        remedy = "convert it to PNG or JPEG"
+    return UserError(problem + counted, remedy)
+
+
+def _unread(path: Path) -> list[Path]:
+    """The files with the name of the image in formats that are not read."""
+    return _named(_without_suffix(path), UNREAD_SUFFIXES)
 
 
 def check_masks(folder: Path, views: Sequence[View]) -> None:

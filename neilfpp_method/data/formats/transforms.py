@@ -5,7 +5,7 @@
     fl_x, fl_y, cx, cy, w, h,         for all frames, or in a frame for that frame;
       k1 … k4, p1, p2                   camera_angle_x (radians) may replace fl_x; if a frame has an angle,
                                         the focal lengths of the file do not apply to it
-    frames[].file_path                the image, relative to the file
+    frames[].file_path                the image, relative to the file; frames without one are left out
     frames[].mask_path                optional: the mask, white on the object
     frames[].transform_matrix         camera to world, 4×4, OpenGL axes (x right, y up, z back)
     train_filenames, test_filenames   optional: the split; without test_filenames, the test views are those
@@ -20,7 +20,7 @@ The world frame is that of the poses in the file, which is also the frame of its
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +43,7 @@ __all__ = [
     "FLIP",
     "LAYOUT",
     "Frame",
+    "Frames",
     "focal_of_angle",
     "pose_from_opengl",
     "read",
@@ -66,14 +67,15 @@ def read(root: Path) -> CaptureFiles:
     """Read the files of the capture, in the order of the frames.
 
     Raises:
-        UserError: the file is malformed, or names an image or a mask that is missing or outside the folder.
+        UserError: the file is malformed, most of its images or one of its masks are missing, or a path leads
+            out of the folder.
     """
     entry = Entry.load(inside(root, root / LAYOUT))
     frames = read_frames(root, entry)
-    names = view_names([frame.listed for frame in frames])
+    names = view_names([frame.listed for frame in frames.existing])
     views = tuple(
         View(name, i, frame.camera, frame.image, frame.mask, frame.valid)
-        for i, (name, frame) in enumerate(zip(names, frames, strict=True))
+        for i, (name, frame) in enumerate(zip(names, frames.existing, strict=True))
     )
     points = _points(root, entry)
     box = _given_box(entry) or find_box(views, points.position)
@@ -83,9 +85,10 @@ def read(root: Path) -> CaptureFiles:
         views=views,
         normalization=box.normalization,
         point_cloud=points.oriented,
-        test=_held_out(root, entry, views),
+        test=_held_out(root, entry, views, frames.missing),
         hdr=response and response.word("linear", "srgb") == "linear",
         scene_from=box.source,
+        missing=frames.missing,
     )
 
 
@@ -116,7 +119,15 @@ class Frame:
     camera: Camera
 
 
-def read_frames(root: Path, entry: Entry) -> tuple[Frame, ...]:
+@dataclass(frozen=True)
+class Frames:
+    """The frames of a transforms file whose images exist, and the `file_path` of those that do not."""
+
+    existing: tuple[Frame, ...]
+    missing: tuple[str, ...]
+
+
+def read_frames(root: Path, entry: Entry) -> Frames:
     """Read the frames of a transforms file.
 
     Raises:
@@ -127,8 +138,11 @@ def read_frames(root: Path, entry: Entry) -> tuple[Frame, ...]:
         raise UserError(f"{entry.where}: no frames", "export the cameras again")
     listed = [frame["file_path"].text() for frame in frames]
     images = stored_images(root, [root / name for name in listed], entry.where)
-    described = zip(frames, listed, images, strict=True)
-    return tuple(_frame(root, entry, frame, name, image) for frame, name, image in described)
+    described = tuple(zip(frames, listed, images, strict=True))
+    return Frames(
+        existing=tuple(_frame(root, entry, frame, name, image) for frame, name, image in described if image),
+        missing=tuple(name for _, name, image in described if image is None),
+    )
 
 
 def _frame(root: Path, entry: Entry, frame: Entry, listed: str, image: Path) -> Frame:
@@ -236,11 +250,13 @@ def pose_from_opengl(entry: Entry) -> Float64[np.ndarray, "4 4"]:
     return w2c
 
 
-def _held_out(root: Path, entry: Entry, views: Sequence[View]) -> frozenset[str] | None:
+def _held_out(
+    root: Path, entry: Entry, views: Sequence[View], missing: Collection[str]
+) -> frozenset[str] | None:
     """The names of the test views: those of `test_filenames`, else those that `train_filenames` lacks."""
     lists = {split: entry.get(f"{split}_filenames") for split in ("train", "test")}
     given = {
-        split: {stored(root, root / name.text()) for name in names.items()}
+        split: {stored(root, root / name.text()) for name in names.items() if name.text() not in missing}
         for split, names in lists.items()
         if names
     }

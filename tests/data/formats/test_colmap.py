@@ -215,8 +215,20 @@ def test_a_model_from_windows(tmp_path: Path) -> None:
 
 def test_images_that_are_missing_or_outside(tmp_path: Path) -> None:
     write(material(tmp_path, masks=None), reconstruction(colmap_camera("PINHOLE")))
-    (tmp_path / "images" / "004.exr").unlink()
-    refused(tmp_path, "004.png", "put the image there")
+    for i in (0, 4):
+        (tmp_path / "images" / f"{i:03d}.exr").unlink()
+    capture = load_capture(tmp_path)
+    assert [(view.name, view.index) for view in capture.views] == [
+        ("001", 0),
+        ("002", 1),
+        ("003", 2),
+        ("005", 3),
+    ]
+    assert np.allclose(capture.views[0].camera.w2c, POSES[1])
+    assert capture.missing == ("000.png", "004.png")
+    for i in (1, 2):
+        (tmp_path / "images" / f"{i:03d}.exr").unlink()
+    refused(tmp_path, "000.png (4 of 6 images are missing)", "put the image there")
     (tmp_path / "images").rename(tmp_path / "elsewhere")
     refused(tmp_path, "no images/000.png", "folder images")
 

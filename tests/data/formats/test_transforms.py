@@ -18,6 +18,7 @@ from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,
     POINTS,
+    POSES,
     PRINCIPAL,
     VIEWS,
     WIDTH,
@@ -227,6 +228,27 @@ def test_lists_of_files_split_the_views(tmp_path: Path) -> None:
     )
 
 
+def test_missing_images_are_left_out(tmp_path: Path) -> None:
+    """As in the fox of instant-ngp, whose cameras were written before a quarter of the images was deleted."""
+    files = [f"images/{i:03d}.exr" for i in range(VIEWS)]
+    scene(tmp_path, train_filenames=files[:4], test_filenames=files[4:])
+    for gone in ("001", "004"):
+        (tmp_path / "images" / f"{gone}.exr").unlink()
+    capture = load_capture(tmp_path)
+    assert [(view.name, view.index) for view in capture.views] == [
+        ("000", 0),
+        ("002", 1),
+        ("003", 2),
+        ("005", 3),
+    ]
+    assert capture.test == {"005"}
+    assert capture.missing == (files[1], files[4])
+    warning = f"warning: 2 of {VIEWS} listed images are missing and left out; the first is {files[1]}"
+    assert warning in capture.summary.splitlines()
+    poses = np.stack([view.camera.w2c for view in capture.views])
+    assert np.allclose(poses, np.stack([POSES[i] for i in (0, 2, 3, 5)]))
+
+
 def test_the_kind_of_files_determines_the_response(tmp_path: Path) -> None:
     assert load_capture(scene(tmp_path / "hdr")).hdr
     assert not load_capture(scene(tmp_path / "ldr", hdr=False)).hdr
@@ -250,8 +272,8 @@ def frame(content: dict) -> dict:
         (lambda c: frame(c).pop("file_path"), ["frames.2.file_path is missing"]),
         (lambda c: frame(c).update(file_path=7), ["frames.2.file_path: not a file name"]),
         (
-            lambda c: frame(c).update(file_path="images/x.png"),
-            ["transforms.json: there is no", "images/x.png; put the image there"],
+            lambda c: [f.update(file_path=f"images/x{i}.png") for i, f in enumerate(c["frames"][:4])],
+            ["transforms.json: there is no", "images/x0.png (4 of 6 images are missing); put the image there"],
         ),
         (lambda c: frame(c).update(file_path="../secret.exr"), ["secret.exr: not a path within the capture"]),
         (lambda c: frame(c).update(file_path="/etc/hostname"), ["hostname: not a path within the capture"]),
