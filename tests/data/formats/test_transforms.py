@@ -273,7 +273,7 @@ def frame(content: dict) -> dict:
         (lambda c: frame(c).update(file_path=7), ["frames.2.file_path: not a file name"]),
         (
             lambda c: [f.update(file_path=f"images/x{i}.png") for i, f in enumerate(c["frames"][:4])],
-            ["transforms.json: there is no", "images/x0.png (4 of 6 images are missing); put the image there"],
+            ["transforms.json: there is no", "x0.png (4 of 6 images are missing); put the image there"],
         ),
         (lambda c: frame(c).update(file_path="../secret.exr"), ["secret.exr: not a path within the capture"]),
         (lambda c: frame(c).update(file_path="/etc/hostname"), ["hostname: not a path within the capture"]),
