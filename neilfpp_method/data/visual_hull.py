@@ -44,6 +44,11 @@ MIN_SEEN_SHARE = 0.25
 """Smallest share of all views that must see a point of the hull; in addition, at least two views must."""
 MIN_CELLS = 64
 """Smallest number of cells of a hull from which the distance field is initialised."""
+MAX_CUT = 0.01
+"""Largest number of hull cells on the faces of the cube, relative to the number of all hull cells to the power of
+2/3, which is about the cross-section of the hull. A hull with more is cut off by the cube: the masks show a ground,
+or the scene box is too small. A few cells come from stray pixels of masks; they are removed.
+"""
 SMOOTHING = 1.5
 """Standard deviation, in cells, of the Gaussian blur that removes the staircase of the cells. With it, the
 normals of a ball of radius 0.6 are wrong by 2° instead of 8°, and its radius is 0.004 too small.
@@ -100,12 +105,11 @@ def find_hull(
     hull = visual_hull(outlines, radius, resolution)
     if hull.sum() < MIN_CELLS:
         return "the masks have almost no region in common"
-    # A hull that reaches the faces of the cube is cut off there: the masks show a ground, or the scene box is
-    # too small.
     faces = np.ones_like(hull)
     faces[1:-1, 1:-1, 1:-1] = False
-    if hull[faces].any():
+    if hull[faces].sum() > MAX_CUT * hull.sum() ** (2 / 3):
         return "the masks show something that extends beyond the scene box"
+    hull[faces] = False
     distance = signed_distance(hull, 2 * radius / resolution, keeps_thin_parts=True)
     return DistanceCube(torch.from_numpy(distance), radius)
 

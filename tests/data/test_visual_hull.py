@@ -177,6 +177,21 @@ def test_masks_without_a_hull_are_reported():
     assert find_hull(black, resolution=32) == "the masks have almost no region in common"
 
 
+def test_stray_pixels_of_masks_do_not_prevent_a_hull():
+    def with_ball(outline: Outline, center: Sequence[float], radius: float) -> Outline:
+        return replace(outline, inside=outline.inside | disc(outline.view.camera, center, radius))
+
+    edge = [1.28, 0.1, 0.0]
+    stray = [with_ball(outline, edge, 0.03) for outline in ring(40)]
+    assert visual_hull(stray, 1.3, 96)[-1].any()
+    hull = find_hull(stray, resolution=96)
+    assert not isinstance(hull, str)
+    assert hull.at(torch.tensor([[0.0, 0.0, 0.0]])) < -0.5
+    assert hull.at(torch.tensor([edge])) > 0
+    large = [with_ball(outline, edge, 0.2) for outline in ring(40)]
+    assert find_hull(large, resolution=96) == "the masks show something that extends beyond the scene box"
+
+
 def test_the_signed_distance_of_a_slab():
     inside = np.zeros((20, 20, 20), bool)
     inside[:10] = True
