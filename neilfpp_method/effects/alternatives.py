@@ -1,4 +1,7 @@
-"""Compare two ways to explain the same places, in views that neither was fitted to."""
+"""Compare two ways to explain the same places, in views that neither was fitted to.
+
+Both have the same mean base colour, at which the comparison does not depend on it (`unbounded_scale`).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neilfpp_method.effects.light_scale import unbounded_scale
 from neilfpp_method.effects.measurement import Measurement, mean_reduction
 from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.effects.place_fit import Permitted, fit_places, mean_errors
@@ -16,8 +20,6 @@ __all__ = ["Alternative", "reduction_in_held_back_views"]
 
 ROUNDS = 3
 """Alternations of light and material in a fit: half of the usual number separate the alternatives as well."""
-SCALE = 0.33
-"""Mean base colour of all fits. The comparison does not depend on the scale of light and base colour."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +34,10 @@ class Alternative:
     data: PlaceData
     metals: bool
 
-    def error(self, turn: int, folds: int) -> Float[Tensor, " P"]:
+    def error(self, turn: int, folds: int, scale: float) -> Float[Tensor, " P"]:
         """Fit with one fold held back; the mean relative error of each place in it, NaN without pixels."""
         split = self.data.hold_back(turn, folds)
-        fit = fit_places(split.known, Permitted(self.metals, SCALE), rounds=ROUNDS)
+        fit = fit_places(split.known, Permitted(self.metals, scale), rounds=ROUNDS)
         return mean_errors(fit, split.held_back)
 
 
@@ -53,5 +55,6 @@ def reduction_in_held_back_views(
         by: what distinguishes the richer alternative, for the description of the measurement.
         worth: reduction above which the richer alternative is used.
     """
-    errors = ((simple.error(turn, folds), rich.error(turn, folds)) for turn in range(turns))
+    scale = unbounded_scale(simple.data)
+    errors = ((simple.error(turn, folds, scale), rich.error(turn, folds, scale)) for turn in range(turns))
     return mean_reduction(errors, f"reduction of the error in held-back views by {by}", worth)

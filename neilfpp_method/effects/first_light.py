@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.lamps import LampTrial
-from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals
+from neilfpp_method.effects.light_scale import FIRST_SCALE, SCALES, lowest_scale, scale_of_metals
 from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
@@ -42,20 +42,17 @@ MIN_PLACES = 100
 """Minimum number of places for an initial light."""
 FOLDS = 5
 """One in this many views is held back."""
-FIRST_SCALE = 0.33
-"""The scale that is fitted first, from an even light; every other fit starts from that of the nearest scale.
-"""
 LAMP_PIXELS = 4096
 """Number of pixels for the search for lamps. With 1024, the gain by lamps on recovered geometry varied from
 −0.4 % to 2.9 % between random selections (true lamps, standard error 0.5 %); with 4096 from 1.3 % to 2.3 %.
 """
 CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
-LOBE_FITS = 3.6
+LOBE_FITS = 3.9
 """Time of the evidence for the lobe in units of a fit to all pixels: four pairs of fits to three quarters of
-them, each with half the usual number of rounds.
+them, each with half the usual number of rounds, and a short fit for their scale.
 """
-METAL_FITS = 3.8
+METAL_FITS = 4.1
 """Time of the evidence for metals in units of a fit to all pixels: four pairs of fits to four fifths of them,
 each with half the usual number of rounds.
 """

@@ -7,12 +7,14 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals
+from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals, unbounded_scale
 from neilfpp_method.effects.material_grid import METALLICS
 from neilfpp_method.effects.place_data import ROWS
 from neilfpp_method.effects.place_fit import PlaceFit
 from neilfpp_method.effects.places import Places
+from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Observed
+from tests.effects.balls import ball, data_of
 
 COUNT, VIEWS = 40, 3
 
@@ -58,3 +60,13 @@ def test_held_back_views_bound_the_scale_of_metals():
 
 def test_few_metals_do_not_determine_the_scale():
     assert chosen({0.22: 0.001, 0.33: 0.0, 0.5: 0.001}, 0.4) is None
+
+
+@pytest.mark.parametrize(("dark", "expected"), [(0.3, 0.33), (0.01, 0.1)])
+def test_few_base_colors_are_at_their_bound(dark: float, expected: float):
+    """White and dark paint: with dark paint of 0.01, a mean of 0.33 would need a white of 10."""
+    base_color = torch.full((60, 3), dark)
+    base_color[::2] = 0.9
+    lobe = LOBES["ggx"]
+    places = ball(base_color, torch.full((60, 1), 0.5), torch.zeros(60, 1), lobe)
+    assert unbounded_scale(data_of(places, lobe)) == expected
