@@ -45,9 +45,9 @@ MIN_SEEN_SHARE = 0.25
 MIN_CELLS = 64
 """Smallest number of cells of a hull from which the distance field is initialised."""
 MAX_CUT = 0.01
-"""Largest number of hull cells on the faces of the cube, relative to the number of all hull cells to the power
-of 2/3, which is about the cross-section of the hull. A hull with more is cut off by the cube: the masks show a
-ground, or the scene box is too small. A few cells come from stray pixels of masks; they are removed.
+"""Largest number of hull cells on the faces of the cube, relative to the number of all hull cells to the
+power of 2/3, which is about the cross-section of the hull. A hull with more is cut off by the cube: the masks
+show a ground, or the scene box is too small. A few cells come from stray pixels of masks; they are removed.
 """
 SMOOTHING = 1.5
 """Standard deviation, in cells, of the Gaussian blur that removes the staircase of the cells. With it, the
