@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from neilfpp_method.lighting.decision import is_worthwhile
 from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 
 __all__ = [
-    "MIN_POINTS",
     "CarriedLight",
     "Evidence",
     "MapAndLamps",
@@ -41,8 +41,6 @@ a lamp that is visible from hardly any point, such as one behind a wall, fits th
 """
 MIN_GAIN = 0.01
 """Smallest reduction of the mean relative error for which lamps are kept."""
-MIN_POINTS = 20
-"""Smallest number of held-back points from which a decision is made."""
 MIN_VISIBLE_SHARE = 0.05
 """Share of the points from which a texel must be visible for the images to determine it. Texels below this
 share are determined by the smoothness prior only.
@@ -87,19 +85,19 @@ class Evidence:
     in_views: bool = False
 
     def favours(self, chosen: bool) -> bool:
-        """Whether the light with lamps should be used.
-
-        Lamps are added if their gain is significant (two standard errors) and at least `MIN_GAIN`. They are
-        removed only if a gain of `MIN_GAIN` is ruled out at the same significance.
+        """Whether the light with lamps should be used; not if there are too few points (`is_worthwhile`).
 
         Args:
             chosen: whether lamps are in use now.
         """
-        if self.points < MIN_POINTS:
-            return False
-        if chosen:
-            return self.gain + 2 * self.deviation > MIN_GAIN
-        return self.gain > max(2 * self.deviation, MIN_GAIN)
+        found = is_worthwhile(
+            benefit=self.gain,
+            deviation=self.deviation,
+            threshold=MIN_GAIN,
+            samples=self.points,
+            chosen=chosen,
+        )
+        return found is True
 
 
 def evidence(gain: Float[Tensor, " N"]) -> Evidence:
