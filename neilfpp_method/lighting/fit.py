@@ -9,7 +9,7 @@ fit avoids this.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -58,10 +58,12 @@ class MapAndLamps:
     Attributes:
         log_radiance: logarithm of the radiance of each texel.
         intensity: radiant intensity of each lamp.
+        log_scale: mean logarithm of the factors on the base colours with which a fit found this light.
     """
 
     log_radiance: Float[Tensor, "3 H W"]
     intensity: Float[Tensor, "M 3"]
+    log_scale: float = 0.0
 
     def strength(self) -> Float[Tensor, "T 3"]:
         """The strengths of all sources: radiance of the texels row by row, then intensity of the lamps."""
@@ -129,6 +131,7 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
     Returns:
         The fitted light; `start` if there are no points or the result is not finite.
     """
+    start = replace(start, log_scale=objective.log_scale or 0.0)
     if not len(target.pixel):
         return start
     unit = objective.unit
@@ -161,9 +164,9 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
         return loss + objective.lamp_prior(unit * root.square().mean(-1), mean_transport @ strength)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
-    descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)
+    end = descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)
     fitted = light()
-    fitted = MapAndLamps(fitted.log_radiance.detach(), fitted.intensity.detach())
+    fitted = MapAndLamps(fitted.log_radiance.detach(), fitted.intensity.detach(), end.log_scale)
     finite = fitted.log_radiance.isfinite().all() and fitted.intensity.isfinite().all()
     return fitted if finite else start
 
@@ -194,18 +197,20 @@ def error_reduction(
 ) -> Float[Tensor, " N"]:
     """Relative error under the first light minus that under the second, at held-back points.
 
-    The relative error of a channel is clipped at 1, so that a few outliers do not dominate the mean.
+    The relative error of a channel is clipped at 1, so that a few outliers do not dominate the mean. Base
+    colours have the scale with which each light was fitted: if the sky fixes the scale of the light, that of
+    the base colours follows from the fit.
 
     Args:
-        first, second: the two lights at the held-back points.
+        first, second: the two fitted lights at the held-back points.
         target: these points and their pixels.
         objective: defines the relative error.
     """
-    gain = math.exp(objective.log_scale or 0.0)
 
     def error(carried: CarriedLight) -> Float[Tensor, " N"]:
-        strength = carried.light.strength()
-        relative = objective.relative_error(strength, carried.transport, target, gain)
+        light = carried.light
+        gain = math.exp(light.log_scale)
+        relative = objective.relative_error(light.strength(), carried.transport, target, gain)
         return relative.abs().clamp_max(1).mean(-1)
 
     return error(first) - error(second)
