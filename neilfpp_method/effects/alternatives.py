@@ -53,5 +53,5 @@ def reduction_in_held_back_views(
         by: what distinguishes the richer alternative, for the description of the measurement.
         worth: reduction above which the richer alternative is used.
     """
-    errors = ((simple.error(turn, folds), rich.error(turn, folds)) for turn in range(turns))
-    return mean_reduction(errors, f"reduction of the error in held-back views by {by}", worth)
+    reductions = (simple.error(turn, folds) - rich.error(turn, folds) for turn in range(turns))
+    return mean_reduction(reductions, f"reduction of the error in held-back views by {by}", worth)

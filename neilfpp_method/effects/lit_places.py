@@ -17,7 +17,7 @@ from neilfpp_method.effects.material_grid import (
     neighbors,
     relative_error,
 )
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places import Places, Split
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.layered_transport import layers_at, light_layers
 from neilfpp_method.lighting.objective import DARK_FLOOR
@@ -61,10 +61,10 @@ class LitPlaces:
         """The same places with only some of the pixels."""
         return LitPlaces(self.places.where(rows), self.parts[:, rows], self.near, self.typical)
 
-    def hold_back(self, fold: int, folds: int) -> tuple[LitPlaces, LitPlaces]:
-        """Known and held-back pixels: one fold of the views, numbered from 0 to `folds` − 1, is held back."""
-        known, held_back = self.places.fold_rows(fold, folds)
-        return self.where(known), self.where(held_back)
+    def hold_back(self, fold: int, folds: int) -> Split[LitPlaces]:
+        """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
+        rows = self.places.fold_rows(fold, folds)
+        return Split(self.where(rows.known), self.where(rows.held_back))
 
     def best(self, metallics: range) -> BestMaterials:
         """The material of each place that explains the pixels best, such as the best `PAINT`."""

@@ -65,16 +65,14 @@ def mean_of(values: Float[Tensor, " N"], what: str, threshold: float) -> Measure
     return Measurement(what, values.double().mean().item(), spread, threshold, count)
 
 
-def mean_reduction(
-    turns: Iterable[tuple[Float[Tensor, " P"], Float[Tensor, " P"]]], what: str, threshold: float
-) -> Measurement:
+def mean_reduction(turns: Iterable[Float[Tensor, " P"]], what: str, threshold: float) -> Measurement:
     """The mean reduction of the error of places, each averaged over the turns first.
 
     Args:
-        turns: for each fold that is held back, the error of each place without the effect and with it; NaN
+        turns: for each fold that is held back, the reduction of the error of each place by the effect; NaN
             for a place without held-back pixels.
         what: description of the measurement.
         threshold: reduction above which the effect is used.
     """
-    reduction = torch.stack([without - with_effect for without, with_effect in turns]).nanmean(0)
+    reduction = torch.stack(list(turns)).nanmean(0)
     return mean_of(reduction[reduction.isfinite()], what, threshold)
