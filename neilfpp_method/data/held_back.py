@@ -66,7 +66,7 @@ def _places(
         return
     kth = np.random.default_rng(seed).integers(of_object.count, size=tries)
     for number in of_object.find(torch.from_numpy(kth)).tolist():
-        view = int(np.searchsorted(pixels.store.starts, number, side="right")) - 1
+        view = int(pixels.store.views_of(np.array(number)))
         start, camera = int(pixels.store.starts[view]), pixels.views[view].camera
         row, column = divmod(number - start, camera.width)
         top, left = row - SIDE // 2, column - SIDE // 2
