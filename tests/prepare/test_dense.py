@@ -8,7 +8,7 @@ import pytest
 
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.views import Normalization
-from neilfpp_method.prepare.depth_fusion import fuse_depth_maps
+from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps
 from neilfpp_method.prepare.depth_planes import fit_planes
 from neilfpp_method.prepare.plane_sweep import GrayView, choose_sources, inverse_depth_step, sweep
 from tests.prepare.textured_corner import FOCAL, photograph, pose
@@ -101,7 +101,8 @@ def test_depths_that_views_agree_on_are_fused_once():
     liar = rng.random(depths[3].shape) < 0.02
     depths[3] = np.where(liar, depths[3] * 0.8, depths[3]).astype(np.float32)
     neighbors = [[j for j in range(7) if j != i] for i in range(7)]
-    points = fuse_depth_maps(cameras, depths, [0.01] * 7, neighbors, lambda: None)
+    maps = [DepthMap(cameras[i], depths[i], 0.01, neighbors[i]) for i in range(7)]
+    points = fuse_depth_maps(maps, lambda: None)
     assert 20_000 < len(points.position) < sum(depth.size for depth in depths) / 2
     distance = np.abs(points.position)
     assert np.median(distance.min(axis=1)) < 1e-3
