@@ -66,6 +66,14 @@ def test_without_neighbors_or_texture_depth_is_unknown():
     assert not sweep(views[0], views[1:], BOX).any()
 
 
+def test_a_camera_that_looks_away_from_the_scene_has_no_depths():
+    """Planes behind the camera would be seen mirrored, and some of their correlations are high."""
+    ahead = [camera(pose(i, 9)) for i in range(3)]
+    turned = [camera(np.diag([-1.0, 1.0, -1.0, 1.0]) @ view.w2c) for view in ahead]
+    views = [GrayView(view, picture(i)) for i, view in enumerate(turned)]
+    assert (sweep(views[1], [views[0], views[2]], BOX) == 0).all()
+
+
 def test_sources_are_neither_too_close_nor_too_far():
     cameras = [camera(pose(i, 13, arc=240)) for i in range(13)]
     chosen = choose_sources([*cameras, cameras[6]], np.array(BOX.center), 3)
