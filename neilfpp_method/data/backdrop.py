@@ -48,7 +48,7 @@ def border_color(pixels: PixelDataset) -> Float[Tensor, " 3"] | None:
     pixels are few or can lie within the scene, which fails if that colour is the ground and the others are
     the sky. Pixels that a mask assigns to the object do not count.
     """
-    numbers, views = border(pixels.store)
+    numbers = border(pixels.store)
     color = border_median(pixels)
     if not len(numbers):
         return None
@@ -57,7 +57,7 @@ def border_color(pixels: PixelDataset) -> Float[Tensor, " 3"] | None:
     def differs(colors: Float32[np.ndarray, "N 3"]) -> Bool[Tensor, " N"]:
         return (pixels.linear(colors) - color).abs().amax(dim=-1) > tolerance
 
-    others = numbers[differs(pixels.store.colors(numbers, views)).numpy()]
+    others = numbers[differs(border_colors(pixels)).numpy()]
     if len(others) > (1 - BORDER_SHARE) * len(numbers):
         return None
     if len(others) <= MIN_OTHER_SHARE * len(numbers):
@@ -73,7 +73,8 @@ def border_median(pixels: PixelDataset) -> Float[Tensor, " 3"]:
 
 def border_colors(pixels: PixelDataset) -> Float32[np.ndarray, "B 3"]:
     """Return the stored colours of the valid pixels on the image borders."""
-    return pixels.store.colors(*border(pixels.store))
+    numbers = border(pixels.store)
+    return pixels.store.colors(numbers, pixels.store.views_of(numbers))
 
 
 def _within_the_scene(

@@ -65,8 +65,8 @@ def _places(
     if not of_object.count:
         return
     kth = np.random.default_rng(seed).integers(of_object.count, size=tries)
-    for number in of_object.find(torch.from_numpy(kth)).tolist():
-        view = int(np.searchsorted(pixels.store.starts, number, side="right")) - 1
+    numbers = of_object.find(torch.from_numpy(kth)).numpy()
+    for number, view in zip(numbers.tolist(), pixels.store.views_of(numbers).tolist(), strict=True):
         start, camera = int(pixels.store.starts[view]), pixels.views[view].camera
         row, column = divmod(number - start, camera.width)
         top, left = row - SIDE // 2, column - SIDE // 2

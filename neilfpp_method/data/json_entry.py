@@ -15,22 +15,32 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["Entry", "write_json"]
 
+CAMERAS = "export the cameras again"
+"""Remedy for a damaged file of cameras, which most of these files are."""
+
 
 class Entry:
-    """A value in a JSON file, and its place (`where`) for error messages."""
+    """A value in a JSON file, and its place (`where`) for error messages.
 
-    def __init__(self, value: Any, where: str) -> None:
+    Args:
+        value: the value.
+        where: the file, and the keys that lead to the value.
+        remedy: how to repair the file.
+    """
+
+    def __init__(self, value: Any, where: str, remedy: str = CAMERAS) -> None:
         self.value = value
         self.where = where
+        self.remedy = remedy
 
     @staticmethod
-    def load(path: Path) -> Entry:
-        """Read a file and return its root value."""
+    def load(path: Path, remedy: str = CAMERAS) -> Entry:
+        """Read a file and return its root value; the remedy also applies to all entries of the file."""
         try:
             # Programs on Windows write a byte order mark at the beginning.
-            return Entry(json.loads(path.read_text("utf-8-sig")), str(path))
+            return Entry(json.loads(path.read_text("utf-8-sig")), str(path), remedy)
         except (ValueError, OSError, RecursionError) as error:
-            raise UserError(f"{path}: not valid JSON ({error})", "export the cameras again") from error
+            raise UserError(f"{path}: not valid JSON ({error})", remedy) from error
 
     def name(self, key: str) -> str:
         """Return the place of an entry of this object."""
@@ -39,19 +49,19 @@ class Entry:
     def entries(self) -> Mapping[str, Any]:
         """Return the entries of a JSON object."""
         if not isinstance(self.value, dict):
-            raise UserError(f"{self.where}: not a JSON object", "export the cameras again")
+            raise UserError(f"{self.where}: not a JSON object", self.remedy)
         return self.value
 
     def items(self) -> list[Entry]:
         """Return the elements of a JSON list."""
         if not isinstance(self.value, list):
-            raise UserError(f"{self.where}: not a JSON list", "export the cameras again")
-        return [Entry(value, self.name(str(i))) for i, value in enumerate(self.value)]
+            raise UserError(f"{self.where}: not a JSON list", self.remedy)
+        return [Entry(value, self.name(str(i)), self.remedy) for i, value in enumerate(self.value)]
 
     def __getitem__(self, key: str) -> Entry:
         if key not in self.entries():
-            raise UserError(f"{self.name(key)} is missing", "export the cameras again")
-        return Entry(self.value[key], self.name(key))
+            raise UserError(f"{self.name(key)} is missing", self.remedy)
+        return Entry(self.value[key], self.name(key), self.remedy)
 
     def get(self, key: str) -> Entry | None:
         """Return an entry; None if it is missing or null."""
@@ -82,7 +92,7 @@ class Entry:
             problem = (
                 "not a finite number" if shapes == ((),) else f"not {wanted or 'a list of'} finite numbers"
             )
-            raise UserError(f"{self.where}: {problem}", "export the cameras again")
+            raise UserError(f"{self.where}: {problem}", self.remedy)
         return numbers
 
     def number(self) -> float:

@@ -90,6 +90,10 @@ class PixelStore:
         """Return the colours of a view."""
         return self.encoding.decode(np.asarray(self.codes[self.indices(i)]), self.scales[i])
 
+    def views_of(self, numbers: Int[np.ndarray, "*N"]) -> Int[np.ndarray, "*N"]:
+        """Return the index of the view of each pixel."""
+        return np.searchsorted(self.starts, numbers, side="right") - 1
+
     def release(self) -> None:
         """Unmap the pages of the files; later reads map them again."""
         self._drawn = 0
@@ -127,8 +131,9 @@ def load_pixels(
     """
     if exact and folder is not None:
         raise ValueError("exact pixels can only be stored in memory")
+    images = _Images(tuple(views), hdr, has_ray)
     if folder is None:
-        return _fill_smallest(views, encodings_for(hdr, exact), hdr, has_ray, None, on_view)
+        return _fill_smallest(images, encodings_for(hdr, exact), None, on_view)
     made_from = _made_from(views, hdr)
     reusable = _open(folder, views, made_from)
     if reusable is not None:
@@ -137,7 +142,7 @@ def load_pixels(
     (folder / "store.json").unlink(missing_ok=True)
     with ExitStack() as files:
         paths = {name: files.enter_context(replacing(folder / f"{name}.npy")) for name in ("color", "bits")}
-        store = _fill_smallest(views, encodings_for(hdr), hdr, has_ray, paths, on_view)
+        store = _fill_smallest(images, encodings_for(hdr), paths, on_view)
         description = {
             "format": FORMAT,
             "version": VERSION,
@@ -157,11 +162,18 @@ def load_pixels(
 # ----------------------------------------------------------------------------------------------------- making
 
 
+@dataclass(frozen=True)
+class _Images:
+    """What a store is filled from; the attributes are the arguments of `load_pixels`."""
+
+    views: tuple[View, ...]
+    hdr: bool
+    has_ray: Callable[[int], Bool[np.ndarray, " N"]]
+
+
 def _fill_smallest(
-    views: Sequence[View],
+    images: _Images,
     ladder: Sequence[Encoding],
-    hdr: bool,
-    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
     paths: dict[str, Path] | None,
     on_view: Callable[[str], None] | None,
 ) -> PixelStore:
@@ -169,7 +181,7 @@ def _fill_smallest(
 
     The encodings are tried from small to large; all views are read again for each.
     """
-    if ladder[0] is BYTES and any(view.file_size is not None for view in views):
+    if ladder[0] is BYTES and any(view.file_size is not None for view in images.views):
         # Averages of 8-bit values are not 8-bit values.
         ladder = ladder[1:]
     reported: set[str] = set()
@@ -179,27 +191,23 @@ def _fill_smallest(
             reported.add(name)
             on_view(name)
 
-    stores = (_fill(views, hdr, encoding, has_ray, paths, report_once) for encoding in ladder)
+    stores = (_fill(images, encoding, paths, report_once) for encoding in ladder)
     return next(store for store in stores if store is not None)
 
 
 def _fill(
-    views: Sequence[View],
-    hdr: bool,
-    encoding: Encoding,
-    has_ray: Callable[[int], Bool[np.ndarray, " N"]],
-    paths: dict[str, Path] | None,
-    on_view: Callable[[str], None],
+    images: _Images, encoding: Encoding, paths: dict[str, Path] | None, on_view: Callable[[str], None]
 ) -> PixelStore | None:
     """Fill a store with the given encoding; return None if the encoding cannot represent a view."""
+    views = images.views
     total = sum(view.camera.width * view.camera.height for view in views)
     codes = _plane(paths and paths["color"], (total, 3), encoding.dtype)
     bits = _plane(paths and paths["bits"], (-(-total // BLOCK) * BLOCK,), np.dtype(np.uint8))
-    store = PixelStore(tuple(views), encoding, np.ones(len(views)), codes, bits)
+    store = PixelStore(views, encoding, np.ones(len(views)), codes, bits)
     broken: list[tuple[View, int]] = []
     unknown = []
     for i, view in enumerate(views):
-        pixels = read_view(view, hdr)
+        pixels = read_view(view, images.hdr)
         if pixels.broken:
             broken.append((view, pixels.broken))
         elif not broken:
@@ -207,7 +215,7 @@ def _fill(
             if encoded is None:
                 return None
             codes[store.indices(i)], store.scales[i] = encoded.codes.reshape(-1, 3), encoded.scale
-            bits[store.indices(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & has_ray(i))
+            bits[store.indices(i)] = _bits(pixels.mask, pixels.valid.reshape(-1) & images.has_ray(i))
             if pixels.mask is None:
                 unknown.append(i)
             store.release()
@@ -242,8 +250,8 @@ def _mask_from_background(store: PixelStore) -> None:
     For all other pixels the mask remains unknown. Rendered captures and clipped backdrops have such pixels;
     photographs of other backdrops have few because of noise.
     """
-    numbers, view = border(store)
-    colors = store.colors(numbers, view)
+    numbers = border(store)
+    colors = store.colors(numbers, store.views_of(numbers))
     if not len(colors):
         return
     color = _median(colors)
@@ -265,22 +273,20 @@ def _median(values: Float32[np.ndarray, "N C"]) -> Float32[np.ndarray, " C"]:
     return np.partition(values, (len(values) - 1) // 2, axis=0)[(len(values) - 1) // 2]
 
 
-def border(store: PixelStore) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, " B"]]:
-    """Return the indices of the valid pixels on the borders of all images, and their views.
+def border(store: PixelStore) -> Int[np.ndarray, " B"]:
+    """Return the indices of the valid pixels on the borders of all images.
 
     Pixels that a mask assigns to the object are left out: an object that extends beyond the image is not a
     part of the background.
     """
-    numbers, views = [], []
+    numbers = []
     for i, view in enumerate(store.views):
         width, height = view.camera.width, view.camera.height
         row, left = np.arange(width), np.arange(1, height - 1) * width
         edge = store.starts[i] + np.concatenate([row, (height - 1) * width + row, left, left + width - 1])
         bits, on_object = store.bits[edge], KNOWN | MASK
-        edge = edge[((bits & VALID) > 0) & ((bits & on_object) != on_object)]
-        numbers.append(edge)
-        views.append(np.full(len(edge), i))
-    return np.concatenate(numbers), np.concatenate(views)
+        numbers.append(edge[((bits & VALID) > 0) & ((bits & on_object) != on_object)])
+    return np.concatenate(numbers)
 
 
 # -------------------------------------------------------------------------------------------------- the files

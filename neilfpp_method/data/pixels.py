@@ -115,7 +115,7 @@ class PixelDataset:
         Image gradients take nine reads per pixel; without `gradients` they are 0.
         """
         numbers = self.draw(count).numpy()
-        views = self._views_of(numbers)
+        views = self.store.views_of(numbers)
         colors = self.store.colors(numbers, views)
         return self._batch(numbers, views, colors, self._gradients_at(numbers, views) if gradients else None)
 
@@ -125,7 +125,7 @@ class PixelDataset:
 
     def view_of(self, numbers: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
         """Return the index of the view of each pixel."""
-        return torch.from_numpy(self._views_of(numbers.cpu().numpy()))
+        return torch.from_numpy(self.store.views_of(numbers.cpu().numpy()))
 
     def leave_out(self, numbers: Int[Tensor, " N"]) -> None:
         """Exclude pixels from all later draws; see `data.held_back`."""
@@ -134,7 +134,7 @@ class PixelDataset:
     def numbered(self, numbers: Int[Tensor, " N"]) -> PixelBatch:
         """Return pixels by index, in the given order, without image gradients."""
         chosen = numbers.cpu().numpy()
-        views = self._views_of(chosen)
+        views = self.store.views_of(chosen)
         return self._batch(chosen, views, self.store.colors(chosen, views), None)
 
     def view(self, i: int, gradients: bool = True) -> PixelBatch:
@@ -160,9 +160,6 @@ class PixelDataset:
     def near(self, i: int) -> Bool[Tensor, " N"]:
         """Return which pixels of `views[i]` are on or near the object; all false if the object is unknown."""
         return self._bit(self.store.bits[self.store.indices(i)], NEAR)
-
-    def _views_of(self, numbers: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-        return np.searchsorted(self.store.starts, numbers, side="right") - 1
 
     def _bit(self, bits: np.ndarray, bit: int) -> Bool[Tensor, " N"]:
         return torch.from_numpy((bits & bit) > 0).to(self.device)

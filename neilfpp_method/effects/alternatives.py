@@ -56,5 +56,5 @@ def reduction_in_held_back_views(
         worth: reduction above which the richer alternative is used.
     """
     scale = unbounded_scale(simple.data)
-    errors = ((simple.error(turn, folds, scale), rich.error(turn, folds, scale)) for turn in range(turns))
-    return mean_reduction(errors, f"reduction of the error in held-back views by {by}", worth)
+    reductions = (simple.error(turn, folds, scale) - rich.error(turn, folds, scale) for turn in range(turns))
+    return mean_reduction(reductions, f"reduction of the error in held-back views by {by}", worth)

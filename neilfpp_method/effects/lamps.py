@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from neilfpp_method.effects.material_grid import ROUGHNESSES
-from neilfpp_method.effects.place_data import PlaceData, Split
+from neilfpp_method.effects.place_data import PlaceData
 from neilfpp_method.effects.place_fit import PlaceFit, mean_errors
+from neilfpp_method.effects.places import Split
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.fit import Evidence, evidence
 from neilfpp_method.lighting.lamp_transport import in_sight
@@ -35,7 +36,7 @@ class LampTrial:
         refit: fits light and materials.
     """
 
-    split: Split
+    split: Split[PlaceData]
     refit: Callable[[PlaceData], PlaceFit]
 
     @torch.no_grad()

@@ -17,9 +17,10 @@ from neilfpp_method.effects.material_grid import (
     neighbors,
     relative_error,
 )
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places import Places, Split
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.layered_transport import layers_at, light_layers
+from neilfpp_method.lighting.objective import DARK_FLOOR
 from neilfpp_method.lighting.transport import outgoing_radiance
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material
@@ -38,8 +39,6 @@ of the same look are often of one material.
 """
 MIN_ROUGHNESS = 0.05
 """Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
-MIN_BASE_COLOR = 0.02
-"""Base colours are raised to at least this value before their logarithms are compared."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +61,10 @@ class LitPlaces:
         """The same places with only some of the pixels."""
         return LitPlaces(self.places.where(rows), self.parts[:, rows], self.near, self.typical)
 
-    def hold_back(self, fold: int, folds: int) -> tuple[LitPlaces, LitPlaces]:
-        """Known and held-back pixels: one fold of the views, numbered from 0 to `folds` − 1, is held back."""
-        known, held_back = self.places.fold_rows(fold, folds)
-        return self.where(known), self.where(held_back)
+    def hold_back(self, fold: int, folds: int) -> Split[LitPlaces]:
+        """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
+        rows = self.places.fold_rows(fold, folds)
+        return Split(self.where(rows.known), self.where(rows.held_back))
 
     def best(self, metallics: range) -> BestMaterials:
         """The material of each place that explains the pixels best, such as the best `PAINT`."""
@@ -102,6 +101,6 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     shared = places.shared_points()
     light = LightModel(model.light, model.lamps)
     draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]
-    look = COLOR_SCALE * model.brdf(shared.position).base_color.clamp_min(MIN_BASE_COLOR).log()
+    look = COLOR_SCALE * model.brdf(shared.position).base_color.clamp_min(DARK_FLOOR).log()
     near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
     return LitPlaces(places, torch.stack(draws).mean(0), near, model.facts.median_radiance)

@@ -21,7 +21,7 @@ from neilfpp_method.data.pixels import PixelDataset
 from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.noise import lobe_noise
-from neilfpp_method.effects.place_data import PlaceData, Split, place_transport
+from neilfpp_method.effects.place_data import PlaceData, place_transport
 from neilfpp_method.effects.place_fit import (
     FIRST_STEPS,
     ROUNDS,
@@ -33,7 +33,7 @@ from neilfpp_method.effects.place_fit import (
     place_errors,
     seconds_of_step,
 )
-from neilfpp_method.effects.places import gather_places
+from neilfpp_method.effects.places import Split, gather_places
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES
@@ -182,7 +182,7 @@ class Explained:
     error: Float[Tensor, " P"]
 
 
-def explain(split: Split, variant: Variant, start: PlaceFit | None = None) -> Explained:
+def explain(split: Split[PlaceData], variant: Variant, start: PlaceFit | None = None) -> Explained:
     """Fit a variant, from a given fit on if there is one, and evaluate it in the held-back views."""
     known, held_back = variant.restrict(split.known), variant.restrict(split.held_back)
     fit = fit_places(known, variant.permitted, start, ROUNDS if start is None else CARRIED_ROUNDS)

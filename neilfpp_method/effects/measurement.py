@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["MIN_SAMPLES", "Measurement", "mean_of", "mean_reduction"]
+from neilfpp_method.lighting.decision import is_worthwhile
 
-MIN_SAMPLES = 20
-"""Minimum number of independent samples for a decision."""
+__all__ = ["Measurement", "mean_of", "mean_reduction"]
 
 
 @dataclass(frozen=True)
@@ -34,20 +33,18 @@ class Measurement:
     samples: int
 
     def favours(self, chosen: bool) -> bool | None:
-        """Whether the effect should be simulated; None if there are too few samples.
-
-        An effect that is off is switched on if its value is significant (two standard errors) and above the
-        threshold. One that is on stays on unless its value is below the threshold by two standard errors.
-        This hysteresis prevents an effect from being switched back and forth by chance.
+        """Whether the effect should be simulated; None if there are too few samples (`is_worthwhile`).
 
         Args:
             chosen: whether the effect is on now.
         """
-        if self.samples < MIN_SAMPLES:
-            return None
-        if chosen:
-            return self.value + 2 * self.deviation > self.threshold
-        return self.value > max(2 * self.deviation, self.threshold)
+        return is_worthwhile(
+            benefit=self.value,
+            deviation=self.deviation,
+            threshold=self.threshold,
+            samples=self.samples,
+            chosen=chosen,
+        )
 
     def summary(self) -> str:
         """One clause for the console and the report.
@@ -68,16 +65,14 @@ def mean_of(values: Float[Tensor, " N"], what: str, threshold: float) -> Measure
     return Measurement(what, values.double().mean().item(), spread, threshold, count)
 
 
-def mean_reduction(
-    turns: Iterable[tuple[Float[Tensor, " P"], Float[Tensor, " P"]]], what: str, threshold: float
-) -> Measurement:
+def mean_reduction(turns: Iterable[Float[Tensor, " P"]], what: str, threshold: float) -> Measurement:
     """The mean reduction of the error of places, each averaged over the turns first.
 
     Args:
-        turns: for each fold that is held back, the error of each place without the effect and with it; NaN
+        turns: for each fold that is held back, the reduction of the error of each place by the effect; NaN
             for a place without held-back pixels.
         what: description of the measurement.
         threshold: reduction above which the effect is used.
     """
-    reduction = torch.stack([without - with_effect for without, with_effect in turns]).nanmean(0)
+    reduction = torch.stack(list(turns)).nanmean(0)
     return mean_of(reduction[reduction.isfinite()], what, threshold)

@@ -74,18 +74,18 @@ def metals_evidence(data: PlaceData, response: str) -> Measurement:
 @torch.no_grad()
 def metals_evidence_in(lit: LitPlaces, response: str) -> Measurement:
     """The same as `metals_evidence`, under a fixed light."""
-    errors = (_errors_in_held_back_views(lit, turn) for turn in range(FOLDS))
+    reductions = (_reduction_in_held_back_views(lit, turn) for turn in range(FOLDS))
     what = "reduction of the error in held-back views by metals, under the trained light"
     worth = WORTH_IN_DISPLAY_VALUES if response == "srgb" else WORTH_UNDER_LIGHT
-    return mean_reduction(errors, what, worth)
+    return mean_reduction(reductions, what, worth)
 
 
-def _errors_in_held_back_views(lit: LitPlaces, turn: int) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
-    """The error of each place with the best paint, and with metal where it is clearly better."""
-    known, held_back = lit.hold_back(turn, FOLDS)
-    paint, metal = known.best(PAINT), known.best(METAL)
+def _reduction_in_held_back_views(lit: LitPlaces, turn: int) -> Float[Tensor, " P"]:
+    """The error of each place with the best paint, minus that with metal where it is clearly better."""
+    split = lit.hold_back(turn, FOLDS)
+    paint, metal = split.known.best(PAINT), split.known.best(METAL)
     best = metal.where(_is_metal(paint, metal), paint)
-    return held_back.mean_errors(paint.material), held_back.mean_errors(best.material)
+    return split.held_back.mean_errors(paint.material) - split.held_back.mean_errors(best.material)
 
 
 @torch.no_grad()

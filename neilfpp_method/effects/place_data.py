@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from neilfpp_method.effects.material_grid import ROUGHNESSES
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places import Places, Split
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.layered_transport import texel_layers
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer
 
-__all__ = ["PlaceData", "Split", "place_transport"]
+__all__ = ["PlaceData", "place_transport"]
 
 ROWS = 16
 """Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
@@ -45,18 +45,10 @@ class PlaceData:
         """The same places with only some of the pixels."""
         return PlaceData(self.places.where(rows), self.transport[rows], self.typical)
 
-    def hold_back(self, fold: int, folds: int) -> Split:
+    def hold_back(self, fold: int, folds: int) -> Split[PlaceData]:
         """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
-        known, held_back = self.places.fold_rows(fold, folds)
-        return Split(self.where(known), self.where(held_back))
-
-
-@dataclass(frozen=True)
-class Split:
-    """The pixels of the views to which models are fitted, and those of the held-back views."""
-
-    known: PlaceData
-    held_back: PlaceData
+        rows = self.places.fold_rows(fold, folds)
+        return Split(self.where(rows.known), self.where(rows.held_back))
 
 
 @torch.no_grad()

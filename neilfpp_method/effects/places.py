@@ -6,6 +6,7 @@ Materials are distinguished by the change of a place's pixels from view to view.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,7 +21,7 @@ from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Observed, OrientedPoints
 
-__all__ = ["Places", "gather_places"]
+__all__ = ["Places", "Split", "gather_places"]
 
 MIN_COSINE = 0.15
 """Minimum cosine between normal and viewing direction. At flatter angles a pixel covers too much of the
@@ -30,6 +31,16 @@ MAX_OFFSET = 2.5
 """Maximum distance between a place and the hit of a pixel that is assigned to it, in pixels."""
 SAME_NORMAL = 0.9
 """Minimum cosine between the normal at a place and at the hit of a pixel that is assigned to it."""
+
+Part = TypeVar("Part")
+
+
+@dataclass(frozen=True)
+class Split(Generic[Part]):
+    """What belongs to the views to which models are fitted, and what belongs to the held-back views."""
+
+    known: Part
+    held_back: Part
 
 
 @dataclass(frozen=True)
@@ -78,15 +89,15 @@ class Places:
         has_pixels = torch.bincount(self.place, minlength=self.count) > 0
         return torch.where(has_pixels, self.mean(values), torch.nan)
 
-    def fold_rows(self, fold: int, folds: int) -> tuple[Int[Tensor, " K"], Int[Tensor, " H"]]:
-        """Indices of the pixels of known and of held-back views.
+    def fold_rows(self, fold: int, folds: int) -> Split[Tensor]:
+        """Indices of the pixels of each part of the views.
 
         Args:
             fold: the fold of the views that is held back, from 0 to `folds` − 1.
             folds: number of folds.
         """
         is_held_back = self.view % folds == fold
-        return torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0]
+        return Split(torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0])
 
     def shared_points(self) -> SharedPoints:
         """One point per place, the mean of the points that its pixels show, from which rays are traced."""

@@ -14,9 +14,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.effects.measurement import MIN_SAMPLES, Measurement, mean_of
+from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.pose_fit import fit_poses, pixel_errors
 from neilfpp_method.fields.poses import PoseMotion
+from neilfpp_method.lighting.decision import MIN_SAMPLES
 from neilfpp_method.model import NeilfModel
 
 __all__ = ["WORTH", "next_motion", "pose_evidence"]

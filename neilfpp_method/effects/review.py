@@ -5,6 +5,7 @@ These are before training, before material init, before the joint stage, and aft
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -137,12 +138,12 @@ def review_light(
     `max_pixels`, the maximum number of pixels of the places; below `MIN_PIXELS` nothing is measured.
     """
     if len(pixels.views) < MIN_TRAIN_VIEWS:
-        return _not_measured(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views")
+        return _without_light(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views")
     if max_pixels < MIN_PIXELS:
-        return _not_measured(plan, step, "the budget leaves no time for it")
+        return _without_light(plan, step, "the budget leaves no time for it")
     places = light_places(model, pixels, max_pixels)
     if places.shown_count < MIN_PLACES:
-        return _not_measured(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
+        return _without_light(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
     with model.evaluating():
         return _review_light_at(places, plan, model, step)
 
@@ -226,13 +227,13 @@ def review_poses(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int)
     if not plan.is_open("poses") or plan.newest("poses") is not None:
         return []
     if step < POSE_STEPS:
-        reason = f"not measured: R is blurred after fewer than {POSE_STEPS} steps"
-        decision = Decision(step, "poses", False, "evidence", reason)
-        plan.decisions.append(decision)
+        decisions = _not_measured(
+            plan, step, {"poses": False}, f"R is blurred after fewer than {POSE_STEPS} steps"
+        )
     else:
-        decision = plan.decide("poses", pose_evidence(model, pixels), step)
+        decisions = [plan.decide("poses", pose_evidence(model, pixels), step)]
     model.use(plan.config)
-    return [decision]
+    return decisions
 
 
 @torch.no_grad()
@@ -300,14 +301,19 @@ def record_lamps(plan: Plan, evidence: Evidence | None, count: int, step: int) -
     return plan.decisions[-1:]
 
 
-def _not_measured(plan: Plan, step: int, reason: str) -> LightReview:
+def _without_light(plan: Plan, step: int, reason: str) -> LightReview:
     """Record that the lobe and metals stay as they are, if they are open."""
-    open_names = [name for name in ("long-tails", "metals") if plan.is_open(name)]
+    unchanged = {name: plan.is_on(name) for name in ("long-tails", "metals") if plan.is_open(name)}
+    return LightReview(_not_measured(plan, step, unchanged, reason), None)
+
+
+def _not_measured(plan: Plan, step: int, effects: Mapping[str, bool], reason: str) -> list[Decision]:
+    """Record for open effects whether they are on, and why there is no evidence."""
     decisions = [
-        Decision(step, name, plan.is_on(name), "evidence", f"not measured: {reason}") for name in open_names
+        Decision(step, name, on, "evidence", f"not measured: {reason}") for name, on in effects.items()
     ]
     plan.decisions += decisions
-    return LightReview(decisions, None)
+    return decisions
 
 
 def _rendered_surface(model: NeilfModel, pixels: PixelBatch) -> RenderedSurface:

@@ -50,7 +50,7 @@ class BrdfField(nn.Module):
         activation = "sine" if isinstance(encoding, FrequencyConfig) else "relu"
         skip = middle_skip(config.layers)
         self.mlp = Mlp(
-            self.encoding.width, 5, config.layers, config.width, activation, skip, output_scale=1e-2
+            self.encoding.width, 5, config.layers, config.width, activation, skip=skip, output_scale=1e-2
         )
         nn.init.zeros_(self.mlp.layers[-1].bias)
         with torch.no_grad():

@@ -15,10 +15,15 @@ from torch import Tensor
 from torch.nn import functional
 
 __all__ = [
+    "closed_in_azimuth",
     "cos_edges",
+    "direction_at",
     "directions_within",
+    "grid_position",
     "interpolate",
     "map_directions",
+    "row_solid_angles",
+    "texel_at",
     "texel_centers",
     "texel_means",
     "texel_solid_angles",
@@ -34,19 +39,38 @@ interpolation along one axis.
 def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> Float[Tensor, "M S C"]:
     """Interpolate a map bilinearly at unit directions; it is periodic in azimuth."""
     _, height, width = values.shape
-    column, row = _columns_and_rows(wi, height, width)
-    # One more column on each side makes the map periodic. The azimuth of a column is that of its middle.
-    closed = torch.cat((values[..., -1:], values, values[..., :1]), -1)
-    at = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-    return functional.grid_sample(closed[None], at[None].to(closed.dtype), align_corners=True)[0].permute(
-        1, 2, 0
-    )
+    closed = closed_in_azimuth(values)
+    at = grid_position(*_columns_and_rows(wi, height, width), height, width).to(closed.dtype)
+    return functional.grid_sample(closed[None], at[None], align_corners=True)[0].permute(1, 2, 0)
 
 
 def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor, "*B"]:
     """Row-major index of the texel that contains a unit direction."""
-    column, row = _columns_and_rows(wi, height, width)
+    return texel_at(*_columns_and_rows(wi, height, width), height, width)
+
+
+def texel_at(
+    column: Float[Tensor, "*B"], row: Float[Tensor, "*B"], height: int, width: int
+) -> Int[Tensor, "*B"]:
+    """Row-major index of the texel nearest to a position in texels; periodic in azimuth."""
     return (row + 0.5).long().clamp(0, height - 1) * width + (column + 0.5).floor().long() % width
+
+
+def closed_in_azimuth(values: Float[Tensor, "C H W"]) -> Float[Tensor, "C H E"]:
+    """The map with one more column on each side, so that bilinear interpolation wraps around in azimuth."""
+    return torch.cat((values[..., -1:], values, values[..., :1]), -1)
+
+
+def grid_position(
+    column: Float[Tensor, "*B"], row: Float[Tensor, "*B"], height: int, width: int
+) -> Float[Tensor, "*B 2"]:
+    """Positions in texels of a map, as `grid_sample` with `align_corners` expects them of the closed map.
+
+    Args:
+        column, row: positions, 0 at the middle of the first column and row.
+        height, width: size of the map, without the two columns of `closed_in_azimuth`.
+    """
+    return torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
 
 
 def texel_means(values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
@@ -66,9 +90,12 @@ def map_directions(height: int, width: int) -> Float[Tensor, "height width 3"]:
 
 def texel_solid_angles(height: int, width: int, device: torch.device | str = "cpu") -> Float[Tensor, " T"]:
     """Solid angles of the texels, row by row, in sr; their sum is 4π."""
-    edges = cos_edges(height, device)
-    rows = (edges[:-1] - edges[1:]) * 2 * math.pi / width
-    return rows[:, None].expand(-1, width).reshape(-1)
+    return row_solid_angles(cos_edges(height, device), width)[:, None].expand(-1, width).reshape(-1)
+
+
+def row_solid_angles(edges: Float[Tensor, " E"], width: int) -> Float[Tensor, " H"]:
+    """Solid angle of a texel of each row, in sr, from the cosines of the edges of the rows."""
+    return (edges[:-1] - edges[1:]) * 2 * math.pi / width
 
 
 def directions_within(
@@ -81,7 +108,11 @@ def directions_within(
     row, column = texel // width, texel % width
     edges = cos_edges(height, down.device).to(down.dtype)
     cos_theta = torch.lerp(edges[row], edges[row + 1], down)
-    phi = 2 * math.pi * (column + across) / width
+    return direction_at(cos_theta, 2 * math.pi * (column + across) / width)
+
+
+def direction_at(cos_theta: Float[Tensor, "*B"], phi: Float[Tensor, "*B"]) -> Float[Tensor, "*B 3"]:
+    """Unit directions at the cosine of the angle from +z and at the azimuth φ, radians."""
     sin_theta = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
     return torch.stack((phi.sin() * sin_theta, phi.cos() * sin_theta, cos_theta), -1)
 

@@ -120,6 +120,7 @@ class Mlp(nn.Module):
         layers: int,
         width: int,
         activation: Literal["softplus", "relu", "sine"],
+        *,
         skip: int | None = None,
         output_scale: float = 1.0,
     ) -> None:

@@ -45,9 +45,8 @@ class SdfField(nn.Module):
         waves = isinstance(encoding, FrequencyConfig)
         self.encoding = position_encoding(encoding, radius, None if waves else encoding.sdf_log2_entries)
         outputs = 1 + config.feature_width
-        self.mlp = Mlp(
-            self.encoding.width, outputs, config.layers, config.width, "softplus", middle_skip(config.layers)
-        )
+        skip = middle_skip(config.layers)
+        self.mlp = Mlp(self.encoding.width, outputs, config.layers, config.width, "softplus", skip=skip)
         geometric_init_(self.mlp, FIRST_RADIUS, extent=radius, encoded=0.0 if waves else 1.0)
         if waves:
             weight_normalize_(self.mlp)

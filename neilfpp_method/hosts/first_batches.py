@@ -14,6 +14,7 @@ from torch import Tensor
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.other_viewpoints import CLOSE, SAME_POINT, OtherViewpoints, other_viewpoints
+from neilfpp_method.hosts.outputs import MAX_MEDIAN_DISTANCE
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
 from neilfpp_method.structures import OrientedPoints, PixelBatch, RayBatch, SurfaceHits
@@ -25,14 +26,12 @@ BATCHES = 10
 UNIT = 1e-3
 """Largest difference of the length of a direction from 1."""
 OFF_RAY = 0.02
-"""Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
+"""Distance of a hit from its ray, relative to its distance from the origin of the ray, above which the hit is
+wrong. `check_host` permits half of it, but of no hit more.
+"""
 MAX_WRONG_SHARE = 0.5
 """Largest permitted share of hits that are off their rays or have normals that face away from the viewer.
 Blending over two surfaces causes a few such hits in a correct host.
-"""
-MAX_MEDIAN_DISTANCE = 1.5
-"""Median distance of hits from the origin above which the scene is too large, scene units. An object in the
-unit sphere may stand on a ground.
 """
 LOST_DISTANCE = 10.0
 """Median distance of hits from the origin above which nothing can be estimated: the fields of material and

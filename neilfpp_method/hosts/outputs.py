@@ -12,12 +12,16 @@ from torch import Tensor
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import RayBatch, SurfaceHits
 
-__all__ = ["OutputCheck", "check_normals", "check_tensors", "host_name"]
+__all__ = ["MAX_MEDIAN_DISTANCE", "OutputCheck", "check_normals", "check_tensors", "host_name"]
 
 SHAPES = {"color": (3,), "position": (3,), "normal": (3,), "opacity": (), "concentration": ()}
 """Shape of one row of each output."""
 UNIT = 1e-2
 """Largest difference of the length of a normal from 1: blending in half precision loses some digits."""
+MAX_MEDIAN_DISTANCE = 1.5
+"""Median distance of hits from the origin above which the scene is too large, scene units. An object in the
+unit sphere may stand on a ground.
+"""
 
 log = logging.getLogger(__name__)
 

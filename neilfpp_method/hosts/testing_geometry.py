@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from neilfpp_method.hosts.other_viewpoints import CLOSE, SAME_POINT, OtherViewpoints, other_viewpoints
+from neilfpp_method.hosts.outputs import MAX_MEDIAN_DISTANCE
 from neilfpp_method.hosts.testing_case import HIT_SHARE, Case
 from neilfpp_method.structures import OrientedPoints, RayBatch
 
@@ -23,8 +24,6 @@ MAX_SLOPE = 8.0
 """Neighbouring hits that are further apart than this multiple of their rays' distance lie on two surfaces."""
 MAX_ANGLE = 10.0
 """Largest median angle between normals and the surface through neighbouring hits, degrees."""
-MAX_MEDIAN_DISTANCE = 1.5
-"""Largest median distance of hits from the origin, scene units; the object may stand on a ground."""
 
 
 def _in_unit_sphere(case: Case) -> None:

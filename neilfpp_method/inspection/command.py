@@ -14,8 +14,10 @@ from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import write_png
 from neilfpp_method.data.object_source import object_line
+from neilfpp_method.data.views import View
 from neilfpp_method.errors import EarlyEnd
 from neilfpp_method.inspection.defects import Inspection, inspect_capture
+from neilfpp_method.inspection.measure import ViewFigures
 from neilfpp_method.inspection.picture import draw
 
 __all__ = ["run_inspection", "to_json"]
@@ -71,35 +73,15 @@ def run_inspection(
         )
 
 
+FIGURES = ("luminance", "stops", "sharpness", "clipped", "invalid", "broken", "pixels", "levels")
+"""Attributes of `ViewFigures` that `inspect.json` has for each view."""
+
+
 def to_json(inspection: Inspection) -> dict[str, Any]:
     """Return the inspection as plain values, the content of `inspect.json`."""
-    capture, placement = inspection.capture, inspection.placement
-    figures = (
-        "luminance",
-        "stops",
-        "sharpness",
-        "clipped",
-        "invalid",
-        "broken",
-        "pixels",
-        "levels",
-    )
+    each = zip(inspection.capture.views, inspection.views, inspection.factors, strict=True)
     return {
-        "capture": {
-            "name": capture.root.resolve().name,
-            "format": capture.format,
-            "response": "linear" if capture.hdr else "srgb",
-            "views": len(capture.views),
-            "test_views": len(capture.test_views),
-            "missing_images": list(capture.missing),
-            "masks": sum(view.mask is not None for view in capture.views),
-            "validity_masks": sum(view.valid is not None for view in capture.views),
-            "point_cloud": capture.point_cloud is not None,
-            "scene": {"centre": list(capture.normalization.center), "radius": capture.normalization.scale},
-            "scene_from": capture.scene_from,
-            "coverage": placement.coverage,
-            "degrees_between_views": placement.gap,
-        },
+        "capture": _of_capture(inspection),
         "radiance": {"level": inspection.radiance.level, "text": inspection.radiance.text},
         "defects": [
             {
@@ -111,21 +93,39 @@ def to_json(inspection: Inspection) -> dict[str, Any]:
             }
             for defect in inspection.defects
         ],
-        "views": [
-            {
-                "name": view.name,
-                "image": view.image.resolve().relative_to(capture.root.resolve()).as_posix(),
-                "width": view.camera.width,
-                "height": view.camera.height,
-                "exposure": view.exposure,
-                "exposure_factor": factor,
-                "object_from": measured.object_from,
-                **{name: getattr(measured, name) for name in figures},
-            }
-            for view, measured, factor in zip(
-                capture.views, inspection.views, inspection.factors, strict=True
-            )
-        ],
+        "views": [_of_view(inspection.capture.root, *one) for one in each],
+    }
+
+
+def _of_capture(inspection: Inspection) -> dict[str, Any]:
+    capture, placement = inspection.capture, inspection.placement
+    return {
+        "name": capture.root.resolve().name,
+        "format": capture.format,
+        "response": "linear" if capture.hdr else "srgb",
+        "views": len(capture.views),
+        "test_views": len(capture.test_views),
+        "missing_images": list(capture.missing),
+        "masks": sum(view.mask is not None for view in capture.views),
+        "validity_masks": sum(view.valid is not None for view in capture.views),
+        "point_cloud": capture.point_cloud is not None,
+        "scene": {"centre": list(capture.normalization.center), "radius": capture.normalization.scale},
+        "scene_from": capture.scene_from,
+        "coverage": placement.coverage,
+        "degrees_between_views": placement.gap,
+    }
+
+
+def _of_view(root: Path, view: View, measured: ViewFigures, factor: float) -> dict[str, Any]:
+    return {
+        "name": view.name,
+        "image": view.image.resolve().relative_to(root.resolve()).as_posix(),
+        "width": view.camera.width,
+        "height": view.camera.height,
+        "exposure": view.exposure,
+        "exposure_factor": factor,
+        "object_from": measured.object_from,
+        **{name: getattr(measured, name) for name in FIGURES},
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from neilfpp_method.data.images import ImageFile, read_image
 from neilfpp_method.data.object_source import ObjectSource
 from neilfpp_method.data.pixel_store import BORDER_SHARE
 from neilfpp_method.data.silhouettes import Outline, outline_of
-from neilfpp_method.data.view_pixels import pixel_colors
+from neilfpp_method.data.view_pixels import pixel_colors, read_mask
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_linear
@@ -90,8 +89,8 @@ def measure(view: View, hdr: bool) -> ViewFigures:
     try:
         image = read_image(view.image)
         color = pixel_colors(view, image, hdr).numpy()
-        valid = np.ones(color.shape[:2], bool) if view.valid is None else _mask(view.valid, view, color)
-        mask = None if view.mask is None else _mask(view.mask, view, color)
+        valid = np.ones(color.shape[:2], bool) if view.valid is None else read_mask(view.valid, view)
+        mask = None if view.mask is None else read_mask(view.mask, view)
     except UserError as error:
         return ViewFigures(view.name, unreadable=error.problem)
     sound = (np.isfinite(color) & (color >= 0)).all(axis=-1)
@@ -124,14 +123,6 @@ def measure(view: View, hdr: bool) -> ViewFigures:
         outline=outline,
         small=_fitted(linear, THUMBNAIL_SIDE),
     )
-
-
-def _mask(path: Path, view: View, color: Float32[np.ndarray, "H W 3"]) -> Bool[np.ndarray, "H W"]:
-    """Where a mask file of a view is white."""
-    values = read_image(path).mask
-    if values.shape != color.shape[:2]:
-        raise UserError(f"{path}: another size than {view.image}", "make the mask again")
-    return values > 0.5
 
 
 def _off_the_background(

@@ -22,6 +22,7 @@ def sphere_trace(
     radius: float,
     origins: Float[Tensor, "P 3"],
     directions: Float[Tensor, "P 3"],
+    *,
     hit_distance: float,
     steps: int,
     distance: Float[Tensor, " P"],

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neilfpp_method.lighting.objective import EVENNESS, Objective, Target, nearest_points, unevenness
 
-__all__ = ["Unknown", "descend"]
+__all__ = ["Descended", "Unknown", "descend"]
 
 FINAL_RATE_SHARE = 0.05
 """Learning rate of the last step as a share of that of the first."""
@@ -32,6 +32,19 @@ class Unknown:
     rate: float
 
 
+@dataclass(frozen=True)
+class Descended:
+    """The end of a descent.
+
+    Attributes:
+        loss: the loss before the last step.
+        log_scale: mean logarithm of the factors on the base colours, after the last step.
+    """
+
+    loss: float
+    log_scale: float
+
+
 def descend(
     unknowns: Sequence[Unknown],
     gain_rate: float,
@@ -39,7 +52,7 @@ def descend(
     target: Target,
     objective: Objective,
     loss_of: Callable[[Float[Tensor, "#N 3"]], Float[Tensor, ""]],
-) -> Float[Tensor, ""]:
+) -> Descended:
     """Minimise a loss over the unknowns and over factors ("gains") on the base colour of the points.
 
     Every point has a gain per channel; if the base colours are known, all points share it. The mean
@@ -53,10 +66,8 @@ def descend(
         target: the surface points; their base colour and positions define the evenness prior.
         objective: says whether base colours are known, and which scale of them is kept.
         loss_of: the other terms of the loss, as a function of the gains.
-
-    Returns:
-        The loss before the last step.
     """
+    scale = objective.log_scale
     known, base_color = objective.base_color_known, target.material.base_color
     log_gain = torch.zeros_like(base_color[:1] if known else base_color, requires_grad=True)
     nearest = None if known else nearest_points(target.position)
@@ -65,7 +76,6 @@ def descend(
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
-            scale = objective.log_scale
             gain = (log_gain if scale is None else log_gain - log_gain.mean() + scale).exp()
             loss = loss_of(gain)
             if nearest is not None:
@@ -74,4 +84,4 @@ def descend(
             loss.backward()
             optimizer.step()
             schedule.step()
-    return loss.detach()
+    return Descended(loss.item(), log_gain.mean().item() if scale is None else scale)

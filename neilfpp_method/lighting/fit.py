@@ -9,18 +9,18 @@ fit avoids this.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from neilfpp_method.lighting.decision import is_worthwhile
 from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 
 __all__ = [
-    "MIN_POINTS",
     "CarriedLight",
     "Evidence",
     "MapAndLamps",
@@ -41,8 +41,6 @@ a lamp that is visible from hardly any point, such as one behind a wall, fits th
 """
 MIN_GAIN = 0.01
 """Smallest reduction of the mean relative error for which lamps are kept."""
-MIN_POINTS = 20
-"""Smallest number of held-back points from which a decision is made."""
 MIN_VISIBLE_SHARE = 0.05
 """Share of the points from which a texel must be visible for the images to determine it. Texels below this
 share are determined by the smoothness prior only.
@@ -60,10 +58,12 @@ class MapAndLamps:
     Attributes:
         log_radiance: logarithm of the radiance of each texel.
         intensity: radiant intensity of each lamp.
+        log_scale: mean logarithm of the factors on the base colours with which a fit found this light.
     """
 
     log_radiance: Float[Tensor, "3 H W"]
     intensity: Float[Tensor, "M 3"]
+    log_scale: float = 0.0
 
     def strength(self) -> Float[Tensor, "T 3"]:
         """The strengths of all sources: radiance of the texels row by row, then intensity of the lamps."""
@@ -87,19 +87,19 @@ class Evidence:
     in_views: bool = False
 
     def favours(self, chosen: bool) -> bool:
-        """Whether the light with lamps should be used.
-
-        Lamps are added if their gain is significant (two standard errors) and at least `MIN_GAIN`. They are
-        removed only if a gain of `MIN_GAIN` is ruled out at the same significance.
+        """Whether the light with lamps should be used; not if there are too few points (`is_worthwhile`).
 
         Args:
             chosen: whether lamps are in use now.
         """
-        if self.points < MIN_POINTS:
-            return False
-        if chosen:
-            return self.gain + 2 * self.deviation > MIN_GAIN
-        return self.gain > max(2 * self.deviation, MIN_GAIN)
+        found = is_worthwhile(
+            benefit=self.gain,
+            deviation=self.deviation,
+            threshold=MIN_GAIN,
+            samples=self.points,
+            chosen=chosen,
+        )
+        return found is True
 
 
 def evidence(gain: Float[Tensor, " N"]) -> Evidence:
@@ -131,6 +131,7 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
     Returns:
         The fitted light; `start` if there are no points or the result is not finite.
     """
+    start = replace(start, log_scale=objective.log_scale or 0.0)
     if not len(target.pixel):
         return start
     unit = objective.unit
@@ -163,9 +164,9 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
         return loss + objective.lamp_prior(unit * root.square().mean(-1), mean_transport @ strength)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
-    descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)
+    end = descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)
     fitted = light()
-    fitted = MapAndLamps(fitted.log_radiance.detach(), fitted.intensity.detach())
+    fitted = MapAndLamps(fitted.log_radiance.detach(), fitted.intensity.detach(), end.log_scale)
     finite = fitted.log_radiance.isfinite().all() and fitted.intensity.isfinite().all()
     return fitted if finite else start
 
@@ -196,18 +197,20 @@ def error_reduction(
 ) -> Float[Tensor, " N"]:
     """Relative error under the first light minus that under the second, at held-back points.
 
-    The relative error of a channel is clipped at 1, so that a few outliers do not dominate the mean.
+    The relative error of a channel is clipped at 1, so that a few outliers do not dominate the mean. Base
+    colours have the scale with which each light was fitted: if the sky fixes the scale of the light, that of
+    the base colours follows from the fit.
 
     Args:
-        first, second: the two lights at the held-back points.
+        first, second: the two fitted lights at the held-back points.
         target: these points and their pixels.
         objective: defines the relative error.
     """
-    gain = math.exp(objective.log_scale or 0.0)
 
     def error(carried: CarriedLight) -> Float[Tensor, " N"]:
-        strength = carried.light.strength()
-        relative = objective.relative_error(strength, carried.transport, target, gain)
+        light = carried.light
+        gain = math.exp(light.log_scale)
+        relative = objective.relative_error(light.strength(), carried.transport, target, gain)
         return relative.abs().clamp_max(1).mean(-1)
 
     return error(first) - error(second)

@@ -147,7 +147,7 @@ def _descend(
         )
 
     unknowns = (Unknown(position, RATE), Unknown(axis, AXIS_RATE), Unknown(log_intensity, AXIS_RATE))
-    loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).item()
+    loss = descend(unknowns, GAIN_RATE, STEPS, target, objective, lambda gain: loss_of(lamps(), gain)).loss
     settled = lamps()
     settled = FoundLamps(settled.places.detach(), settled.intensity.detach())
     values = torch.cat((settled.places.position, settled.places.axis, settled.intensity))

@@ -10,7 +10,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.images import read_image, write_exr
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.errors import UserError
-from neilfpp_method.prepare.depth_fusion import fuse_depth_maps
+from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps
 from neilfpp_method.prepare.plane_sweep import choose_sources, gray_view, inverse_depth_step, sweep
 from neilfpp_method.prepare.progress import Bars
 from neilfpp_method.prepare.sparse_cloud import without_outliers
@@ -55,7 +55,8 @@ def dense_cloud(capture: Capture, folder: Path, open_bar: Bars) -> WorldPoints:
         for camera, others in zip(cameras, sources, strict=True)
     ]
     neighbors = choose_sources(cameras, center, FUSION_SOURCES)
-    points = fuse_depth_maps(cameras, depths, steps, neighbors, open_bar("fusing depth", len(views)).advance)
+    maps = [DepthMap(*of_view) for of_view in zip(cameras, depths, steps, neighbors, strict=True)]
+    points = fuse_depth_maps(maps, open_bar("fusing depth", len(views)).advance)
     if not len(points.position):
         raise UserError(
             f"{capture.root}: the depth maps of the views agree on no surface",

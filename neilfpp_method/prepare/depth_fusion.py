@@ -17,7 +17,7 @@ from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.prepare.depth_planes import OrientedDepth, fit_planes
 
-__all__ = ["fuse_depth_maps"]
+__all__ = ["DepthMap", "fuse_depth_maps"]
 
 MAX_DISPARITY = 1.5
 """Largest difference of two inverse depths that agree, in steps of one pixel of disparity: the rounding of a
@@ -30,13 +30,24 @@ MIN_VIEWS = 2
 """Number of other views that must confirm a depth. A wrong depth rarely agrees with two others by chance."""
 
 
-def fuse_depth_maps(
-    cameras: Sequence[Camera],
-    depths: Sequence[Float32[np.ndarray, "H W"]],
-    steps: Sequence[float],
-    neighbors: Sequence[Sequence[int]],
-    advance: Callable[[], None],
-) -> WorldPoints:
+@dataclass(frozen=True)
+class DepthMap:
+    """The depth map of a view.
+
+    Attributes:
+        camera: the pinhole camera of the view.
+        depth: depth along the optical axis, world units, 0 if unknown.
+        step: the difference of inverse depth that the map can resolve.
+        neighbors: indices of the views that may confirm its depths.
+    """
+
+    camera: Camera
+    depth: Float32[np.ndarray, "H W"]
+    step: float
+    neighbors: Sequence[int]
+
+
+def fuse_depth_maps(views: Sequence[DepthMap], advance: Callable[[], None]) -> WorldPoints:
     """Fuse depth maps into the oriented points that at least `MIN_VIEWS` other views confirm.
 
     A point of a view is projected into each neighbour. The neighbour confirms it if the inverse depth of its
@@ -45,30 +56,28 @@ def fuse_depth_maps(
     the pixels that were averaged make no further points.
 
     Args:
-        cameras: the pinhole camera of each view.
-        depths: depth along the optical axis of each view, world units, 0 if unknown.
-        steps: for each view, the difference of inverse depth that its depth map can resolve.
-        neighbors: for each view, the indices of the views that may confirm its depths.
+        views: the depth map of each view.
         advance: called after each view, for a progress bar.
 
     Returns:
         Points and unit normals in the world frame; none if the depth maps agree nowhere.
     """
     confirmed = [
-        _count_confirmations(cameras, depths, i, steps[i], others) >= MIN_VIEWS
-        for i, others in enumerate(neighbors)
+        _count_confirmations(view, [views[j] for j in view.neighbors]) >= MIN_VIEWS for view in views
     ]
-    filtered = [np.where(mask, depth, np.float32(0)) for mask, depth in zip(confirmed, depths, strict=True)]
-    maps = [fit_planes(*view) for view in zip(cameras, filtered, steps, strict=True)]
+    filtered = [
+        np.where(mask, view.depth, np.float32(0)) for mask, view in zip(confirmed, views, strict=True)
+    ]
+    maps = [fit_planes(view.camera, depth, view.step) for view, depth in zip(views, filtered, strict=True)]
     used = [depth_map.depth <= 0 for depth_map in maps]
     positions, normals = [], []
-    for i, camera in enumerate(cameras):
+    for i, view in enumerate(views):
         rows, columns = np.nonzero(~used[i])
-        position = _unproject(camera, rows, columns, maps[i].depth[rows, columns])
+        position = _unproject(view.camera, rows, columns, maps[i].depth[rows, columns])
         normal = maps[i].normal[rows, columns].astype(np.float64)
         position_sum, normal_sum, count = position.copy(), normal.copy(), np.ones(len(rows))
-        for j in neighbors[i]:
-            other = _lookup(cameras[j], maps[j], position, steps[i])
+        for j in view.neighbors:
+            other = _lookup(views[j].camera, maps[j], position, view.step)
             agrees = other.agrees & ((other.normal * normal).sum(axis=1) >= MIN_COSINE)
             position_sum[agrees] += other.position[agrees]
             normal_sum[agrees] += other.normal[agrees]
@@ -121,21 +130,15 @@ def _agree(a: Float64[np.ndarray, " N"], b: Float64[np.ndarray, " N"], step: flo
     return known & (difference <= MAX_DISPARITY * step)
 
 
-def _count_confirmations(
-    cameras: Sequence[Camera],
-    depths: Sequence[Float32[np.ndarray, "H W"]],
-    i: int,
-    step: float,
-    others: Sequence[int],
-) -> Float32[np.ndarray, "H W"]:
-    """For each pixel of view `i`, the number of other views whose depth maps agree with its depth."""
-    rows, columns = np.nonzero(depths[i] > 0)
-    position = _unproject(cameras[i], rows, columns, depths[i][rows, columns])
-    count = np.zeros(depths[i].shape, np.float32)
-    for j in others:
-        at = _project(cameras[j], position)
-        depth = depths[j][at.row, at.column].astype(np.float64)
-        count[rows, columns] += _agree(depth, at.depth, step)
+def _count_confirmations(view: DepthMap, others: Sequence[DepthMap]) -> Float32[np.ndarray, "H W"]:
+    """For each pixel of a view, the number of other views whose depth maps agree with its depth."""
+    rows, columns = np.nonzero(view.depth > 0)
+    position = _unproject(view.camera, rows, columns, view.depth[rows, columns])
+    count = np.zeros(view.depth.shape, np.float32)
+    for other in others:
+        at = _project(other.camera, position)
+        depth = other.depth[at.row, at.column].astype(np.float64)
+        count[rows, columns] += _agree(depth, at.depth, view.step)
     return count
 
 

@@ -6,7 +6,7 @@ that a point of the scene looks the same in all copies. Display values are copie
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,7 @@ def write_copies(photos: Photos, folder: Path, advance: Callable[[], None]) -> t
             try:
                 pixels = read_photo(photo.path).pixels
                 if photos.linear:
-                    gain = gain or _common_gain(photos)
+                    gain = gain or _common_gain(photos, exposures)
                     write_png(copy, _tone_mapped(pixels * np.float32(gain / exposures[photo.name])))
                 else:
                     write_png(copy, _to_bytes(pixels))
@@ -69,9 +69,8 @@ def relative_exposures(photos: Photos) -> dict[str, float]:
     return {photo.name: (photo.exposure or median) / median for photo in photos.items}
 
 
-def _common_gain(photos: Photos) -> float:
+def _common_gain(photos: Photos, exposures: Mapping[str, float]) -> float:
     """The factor that brings the median bright level of a sample of photographs to `BRIGHT_VALUE`."""
-    exposures = relative_exposures(photos)
     step = -(-len(photos.items) // GAIN_PHOTOS)
     levels = [
         level / exposures[photo.name]

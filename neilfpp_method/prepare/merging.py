@@ -146,7 +146,9 @@ def _merge(
 ) -> dict[str, float]:
     """Merge the brackets that are not merged yet; return the largest shift of every bracket, in pixels."""
     path = folder / SHIFTS
-    moved = dict(Entry.load(path).entries()) if path.is_file() else {}
+    moved: dict[str, float] = {}
+    if path.is_file():
+        moved.update(Entry.load(path, "delete it: only the reported shifts are lost").entries())
 
     def done(name: str, shift: float | None) -> None:
         if shift is not None:

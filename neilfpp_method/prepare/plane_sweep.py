@@ -157,11 +157,14 @@ def sweep(reference: GrayView, sources: Sequence[GrayView], box: Normalization) 
 
     Returns:
         Depth along the optical axis in world units; 0 if it is unknown: in windows without texture, with a
-        score below `MIN_SCORE`, or with the best score at the first or the last plane.
+        score below `MIN_SCORE`, with the best score at the first or the last plane, or everywhere if the
+        scene's sphere is behind the camera.
     """
     if not sources:
         return np.zeros_like(reference.gray)
     inverse_depths = _planes(reference, sources, box)
+    if not len(inverse_depths):
+        return np.zeros_like(reference.gray)
     windows = _Windows(reference.gray)
     scores = np.stack([_score(reference, sources, windows, float(value)) for value in inverse_depths])
     best = scores.argmax(axis=0)
@@ -191,10 +194,12 @@ class _Windows:
 def _planes(
     reference: GrayView, sources: Sequence[GrayView], box: Normalization
 ) -> Float64[np.ndarray, " D"]:
-    """The inverse depths of the planes, from the farthest to the nearest."""
+    """The inverse depths of the planes, from the farthest to the nearest; none behind the camera."""
     camera = reference.camera
     center_depth = float(camera.w2c[2, :3] @ np.array(box.center) + camera.w2c[2, 3])
     far = center_depth + MARGIN * box.scale
+    if far <= 0:
+        return np.zeros(0)
     near = max(center_depth - MARGIN * box.scale, MIN_DEPTH_RATIO * far)
     step = inverse_depth_step(camera, [source.camera for source in sources])
     count = int((1 / near - 1 / far) / step)

@@ -109,7 +109,7 @@ def trace_paths(
         paths, throughput, directions = paths[hits.rows], throughput[hits.rows], directions[hits.rows]
         if not len(paths):
             break
-        at = _vertices(scene, hits, -directions)
+        at = vertices(hits, -directions, scene.materials(hits.position), scene.lobe)
         if bounce == 0:
             normal[paths] = at.normal
             albedo[paths] = _reflectance(at, scene.lobe)
@@ -135,10 +135,6 @@ def trace_paths(
             throughput = throughput / survival[:, None]
             hits = hits[torch.nonzero((u[:, 8] < survival)[hits.rows])[:, 0]]
     return Traced(radiance, alpha, albedo, normal)
-
-
-def _vertices(scene: Scene, hits: Intersections, wo: Float[Tensor, "N 3"]) -> Vertices:
-    return vertices(hits.position, hits.normal, hits.flat, wo, scene.materials(hits.position), scene.lobe)
 
 
 def _reflectance(at: Vertices, lobe: Lobe | None) -> Float[Tensor, "N 3"]:

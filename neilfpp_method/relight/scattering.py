@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from neilfpp_method.relight.surface import Intersections
 from neilfpp_method.shading.brdf import GGX, Lobe, diffuse_reflectance, evaluate, normal_reflectance
 from neilfpp_method.shading.frame import local_frame
 from neilfpp_method.shading.sampling import pdf_cosine, pdf_specular_lobe
@@ -57,24 +58,26 @@ class Vertices(Indexable):
 
 
 def vertices(
-    position: Float[Tensor, "N 3"],
-    normal: Float[Tensor, "N 3"],
-    flat: Float[Tensor, "N 3"],
-    wo: Float[Tensor, "N 3"],
-    material: Material,
-    lobe: Lobe | None,
+    hits: Intersections, wo: Float[Tensor, "N 3"], material: Material, lobe: Lobe | None
 ) -> Vertices:
     """Build vertices. `share` approximates the lobe's part of the reflectance under constant light."""
     if lobe is None:
-        share = torch.zeros_like(position[:, 0])
+        share = torch.zeros_like(hits.distance)
     else:
-        cosine = (normal * wo).sum(-1, keepdim=True).clamp(0, 1)
+        cosine = (hits.normal * wo).sum(-1, keepdim=True).clamp(0, 1)
         reflectance = normal_reflectance(material)
         specular = (reflectance + (1 - reflectance) * (1 - cosine).pow(5)).mean(-1)
         diffuse = diffuse_reflectance(material).mean(-1)
         share = (specular / (specular + diffuse).clamp_min(1e-6)).clamp(MIN_SHARE, 1 - MIN_SHARE)
     return Vertices(
-        position, normal, flat, wo, material.base_color, material.roughness, material.metallic, share
+        position=hits.position,
+        normal=hits.normal,
+        flat=hits.flat,
+        wo=wo,
+        base_color=material.base_color,
+        roughness=material.roughness,
+        metallic=material.metallic,
+        share=share,
     )
 
 

@@ -14,7 +14,15 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.fields.direction_map import cos_edges, texel_means
+from neilfpp_method.fields.direction_map import (
+    closed_in_azimuth,
+    cos_edges,
+    direction_at,
+    grid_position,
+    row_solid_angles,
+    texel_at,
+    texel_means,
+)
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading.color import luminance
 
@@ -54,11 +62,8 @@ class Sky:
     def lookup(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Radiance that arrives from unit directions, by bilinear interpolation."""
         height, width = self.radiance.shape[:2]
-        column, row = self._to_texels(wi)
-        grid = torch.stack((2 * (column + 1) / (width + 1) - 1, 2 * row / (height - 1) - 1), -1)
-        values = functional.grid_sample(
-            self._closed, grid[None, None], padding_mode="border", align_corners=True
-        )
+        grid = grid_position(*self._to_texels(wi), height, width)[None, None]
+        values = functional.grid_sample(self._closed, grid, padding_mode="border", align_corners=True)
         return values[0, :, 0].T
 
     def sample(self, u: Float[Tensor, "N 2"]) -> SkySample:
@@ -74,16 +79,12 @@ class Sky:
         across = _invert(by_texel, before + u[:, 1] * mass, row * width, row * width + width)
         cos_theta = torch.lerp(self._cos_edges[row], self._cos_edges[row + 1], down.position)
         phi = self.start + 2 * math.pi * (across.index - row * width + across.position) / width
-        sine = ((1 - cos_theta) * (1 + cos_theta)).clamp_min(0).sqrt()
-        wi = torch.stack((phi.sin() * sine, phi.cos() * sine, cos_theta), -1).float()
+        wi = direction_at(cos_theta, phi).float()
         return SkySample(wi, self.pdf(wi))
 
     def pdf(self, wi: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         """Density of `sample` at unit directions, per steradian; constant over a texel."""
-        height, width = self.radiance.shape[:2]
-        column, row = self._to_texels(wi)
-        row = (row + 0.5).long().clamp(0, height - 1)
-        return self._density[row * width + (column + 0.5).floor().long() % width]
+        return self._density[texel_at(*self._to_texels(wi), *self.radiance.shape[:2])]
 
     def _to_texels(self, wi: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
         """Texel coordinates of directions: column in [−½, W − ½), row in [−½, H − ½]."""
@@ -96,9 +97,7 @@ class Sky:
 
     @cached_property
     def _closed(self) -> Float[Tensor, "1 3 H C"]:
-        """The map with one more column on each side, so that interpolation wraps around in azimuth."""
-        planes = self.radiance.permute(2, 0, 1)
-        return torch.cat((planes[..., -1:], planes, planes[..., :1]), -1)[None].contiguous()
+        return closed_in_azimuth(self.radiance.permute(2, 0, 1))[None].contiguous()
 
     @property
     def _cos_edges(self) -> Float[Tensor, " E"]:
@@ -112,7 +111,7 @@ class Sky:
 
     @cached_property
     def _solid_angles(self) -> Float[Tensor, " H"]:
-        return (self._cos_edges[:-1] - self._cos_edges[1:]) * 2 * math.pi / self.radiance.shape[1]
+        return row_solid_angles(self._cos_edges, self.radiance.shape[1])
 
     @cached_property
     def _cumulated(self) -> Float[Tensor, " T"]:

@@ -89,7 +89,9 @@ def at_common_exposure(
 ) -> Float[Tensor, "*shape"]:
     """Convert pixels of a camera with some gain to those of a camera with gain 1, without clipping.
 
-    A pixel that may be clipped still counts as clipped after the conversion, so it remains a lower bound.
+    A pixel that may be clipped still counts as clipped after the conversion, so it remains a lower bound. So
+    does a highlight of an underexposed photograph that is beyond the range of a camera with gain 1, although
+    it was not clipped: pixels have no flag, and as a lower bound its value is right as well.
 
     Args:
         pixel: pixel values in the capture's response.

@@ -205,9 +205,18 @@ def _describe_new(
 
 def _scale_summary(scale: float, pixels: int, rays: int) -> str:
     return (
-        f"images scaled to {scale:.3g} of their size: {pixels / 1e6:.1f} million pixels for "
-        f"{rays / 1e6:.1f} million rays; --scale 1 uses the full size"
+        f"images scaled to {scale:.3g} of their size: {_rounded(pixels)} pixels for "
+        f"{_rounded(rays)} rays; --scale 1 uses the full size"
     )
+
+
+def _rounded(count: int) -> str:
+    """A large number in words; thousands below a million.
+
+    >>> _rounded(2_345_678), _rounded(45_678)
+    ('2.3 million', '46 thousand')
+    """
+    return f"{count / 1e6:.1f} million" if count >= 1e6 else f"{count / 1e3:.0f} thousand"
 
 
 def _exposures_summary(plan: Plan) -> str | None:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neilfpp_method.data.json_entry import write_json
-from neilfpp_method.lighting.fit import MIN_POINTS, Evidence
+from neilfpp_method.lighting.decision import MIN_SAMPLES
+from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig
 from neilfpp_method.train.json_files import read_entries
 
@@ -71,7 +72,7 @@ def light_summary(config: FreeLightConfig | MapLightConfig, fits: Sequence[Light
     if not fits:
         return f"{map_kind} and near lamps" if config.kind == "distant_near" else map_kind
     last = fits[-1]
-    if last.points < MIN_POINTS:
+    if last.points < MIN_SAMPLES:
         return f"{map_kind}; lamps were not decided on, with only {last.points} held-back points"
     size = f"{-100 * last.gain:+.1f} ± {100 * last.deviation:.1f} %".replace("-", "\N{MINUS SIGN}")
     change = f"error {size} at {last.points} held-back points"

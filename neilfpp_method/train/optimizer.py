@@ -129,7 +129,11 @@ class Stream(IntEnum):
 
 
 def seed_stream(seed: int, stream: Stream, step: int = 0) -> None:
-    """Seed the random number generator for a measurement after `step` steps, apart from that of any step."""
+    """Seed the random number generator for a measurement after `step` steps, apart from that of any step.
+
+    Measurements after the same step have different numbers. Those after different steps have the same only if
+    the steps differ by as much as the streams, at most 6, which no schedule of usual length has.
+    """
     seed_step(seed, -stream - step)
 
 

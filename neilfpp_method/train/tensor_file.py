@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickletools
 import re
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,10 @@ def read_tensor_file(path: Path) -> Any:
         for member in members:
             if member.filename.endswith(".pkl"):
                 _check_names(archive.read(member))
-    return torch.load(path, map_location="cpu", weights_only=True)
+    with warnings.catch_warnings():
+        # If torch cannot read another protocol, it also raises an error, which is all that a user needs.
+        warnings.filterwarnings("ignore", "Detected pickle protocol")
+        return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def _check_names(pickle: bytes) -> None:

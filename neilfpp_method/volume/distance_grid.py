@@ -99,10 +99,10 @@ def trace_grid(
         radius,
         origins.to(grid.dtype),
         directions.to(grid.dtype),
-        hit_distance,
-        STEPS,
-        hits.distance,
-        hits.hit,
+        hit_distance=hit_distance,
+        steps=STEPS,
+        distance=hits.distance,
+        hit=hits.hit,
     )
     return hits
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
 
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.fit import CarriedLight, Evidence, MapAndLamps, error_reduction
 from neilfpp_method.lighting.map_transport import from_texels
+from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import Material, Observed
@@ -83,6 +85,28 @@ def test_a_large_visible_part_of_the_light_fixes_the_scale():
     """One fit goes more than half of the way, in logarithms, to the radiance that cameras saw."""
     assert looks_fix_the_scale(below=0.3)
     assert 0.9 < brightness_after_drift(begins=False, sky_below=0.3) < DRIFT**-0.5
+
+
+def test_lights_are_compared_with_base_colours_of_the_fitted_scale():
+    """Base colours are 0.7 of the true ones, and the sky fixes the scale of the light: held-back points that
+    were rendered with these base colours would have an error of 0.3.
+    """
+    seen, of = points(400), material(400)
+    of = dataclasses.replace(of, metallic=0 * of.metallic)
+    sky, wi = SkySightings(8, "linear"), looks(4000, below=0.3)
+    sky.remember(wi, torch.ones_like(wi))
+    transport = from_texels(EnvironmentLight(8, 1.0), seen, of.roughness, None, None)
+    pixel = transport.outgoing(of, torch.ones(8 * 16, 3))
+    target = Target(seen.position, dataclasses.replace(of, base_color=0.7 * of.base_color), pixel)
+    objective = Objective("linear", pixel.median().item(), steps=300, sky=sky.known(), log_scale=None)
+    start = CarriedLight(MapAndLamps(torch.zeros(3, 8, 16), torch.zeros(0, 3)), transport)
+    fitted, held_back = torch.arange(400) % 2 == 0, torch.arange(400) % 2 == 1
+    found = start[fitted].fit(target[fitted], objective)
+    assert 0.1 < found.log_scale < -math.log(0.7), "the fit goes a part of the way"
+    whole = dataclasses.replace(start.light, log_scale=-math.log(0.7))
+    dark = MapAndLamps(torch.full((3, 8, 16), -20.0), torch.zeros(0, 3))
+    lights = [start[held_back].with_light(light) for light in (dark, whole)]
+    assert error_reduction(*lights, target[held_back], objective).mean() > 0.8, "about 0.9 − 0"
 
 
 def looks_fix_the_scale(below: float) -> bool:

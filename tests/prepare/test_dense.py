@@ -8,7 +8,7 @@ import pytest
 
 from neilfpp_method.data.camera import Camera
 from neilfpp_method.data.views import Normalization
-from neilfpp_method.prepare.depth_fusion import fuse_depth_maps
+from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps
 from neilfpp_method.prepare.depth_planes import fit_planes
 from neilfpp_method.prepare.plane_sweep import GrayView, choose_sources, inverse_depth_step, sweep
 from tests.prepare.textured_corner import FOCAL, photograph, pose
@@ -66,6 +66,18 @@ def test_without_neighbors_or_texture_depth_is_unknown():
     assert not sweep(views[0], views[1:], BOX).any()
 
 
+def test_a_camera_that_looks_away_from_the_scene_has_no_depths():
+    """The images match with a disparity of 20 pixels, which is that of an inverse depth of −2.5."""
+    noise = np.random.default_rng(0).random((SIZE[1], SIZE[0] + 40)).astype(np.float32)
+    noise = cv2.GaussianBlur(noise, (0, 0), 3)
+    noise = (noise - noise.min()) / (noise.max() - noise.min())
+    beside = np.eye(4)
+    beside[0, 3] = -8 / (FOCAL * SIZE[0])
+    reference = GrayView(camera(np.eye(4)), np.ascontiguousarray(noise[:, 30:270]))
+    source = GrayView(camera(beside), np.ascontiguousarray(noise[:, 10:250]))
+    assert (sweep(reference, [source], Normalization(0.8, (0.0, 0.0, -1.6))) == 0).all()
+
+
 def test_sources_are_neither_too_close_nor_too_far():
     cameras = [camera(pose(i, 13, arc=240)) for i in range(13)]
     chosen = choose_sources([*cameras, cameras[6]], np.array(BOX.center), 3)
@@ -101,7 +113,8 @@ def test_depths_that_views_agree_on_are_fused_once():
     liar = rng.random(depths[3].shape) < 0.02
     depths[3] = np.where(liar, depths[3] * 0.8, depths[3]).astype(np.float32)
     neighbors = [[j for j in range(7) if j != i] for i in range(7)]
-    points = fuse_depth_maps(cameras, depths, [0.01] * 7, neighbors, lambda: None)
+    maps = [DepthMap(cameras[i], depths[i], 0.01, neighbors[i]) for i in range(7)]
+    points = fuse_depth_maps(maps, lambda: None)
     assert 20_000 < len(points.position) < sum(depth.size for depth in depths) / 2
     distance = np.abs(points.position)
     assert np.median(distance.min(axis=1)) < 1e-3

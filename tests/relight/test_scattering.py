@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from neilfpp_method.relight.scattering import Vertices, brdf_cosine, scatter, scattering_pdf, vertices
+from neilfpp_method.relight.surface import Intersections
 from neilfpp_method.shading.brdf import GGX, LOBES, SPHERICAL_GAUSSIAN
 from neilfpp_method.structures import Material
 from tests import oracles
@@ -25,7 +26,9 @@ def at(
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3)
     one = torch.ones(count, 1)
     material = Material(base * one.expand(-1, 3), roughness * one, metallic * one)
-    return vertices(torch.zeros(count, 3), up, up, wo, material, lobe)
+    rows, all_of_them = torch.arange(count), torch.ones(count, dtype=torch.bool)
+    hits = Intersections(rows, one[:, 0], torch.zeros(count, 3), up, up, all_of_them)
+    return vertices(hits, wo, material, lobe)
 
 
 @pytest.mark.parametrize(("name", "roughness", "metallic"), CASES)
