@@ -101,7 +101,7 @@ def _decode(path: Path, out: Path) -> None:
 
 
 def _saturated(
-    path: Path, mosaic: Shaped[np.ndarray, "..."], white_level: int, size: tuple[int, int]
+    path: Path, mosaic: Shaped[np.ndarray, "*sensor"], white_level: int, size: tuple[int, int]
 ) -> Bool[np.ndarray, "H W"]:
     """Pixels whose colour comes, wholly or in part, from a sensor pixel at its white level.
 
