@@ -63,12 +63,15 @@ SURFACE_ONLY = {"train.sdf_steps": 400, "train.rays": 192, "train.material_steps
 
 
 def trained(look: Look, folder: Path, hdr: bool = True, changes: Mapping[str, object] | None = None) -> Run:
-    """Write a capture, train it as `neilfpp train --effects as-set` does, and load the run."""
+    """Write a capture, train it as `neilfpp train` does, and load the run.
+
+    Poses and exposures are not corrected, as `--effects auto` decides here; the evidence for the other effects
+    is not measured, which would take minutes.
+    """
     root = write_capture(folder / "capture", look, hdr=hdr)
     config = changed(preset("fast"), {**SMALLER, **(changes or {})})
-    request = TrainingRequest(
-        data=root, out=folder / "run", config=config, effects=EffectRequest("as-set"), device="cpu"
-    )
+    effects = EffectRequest("as-set", {"poses": False, "exposure": False})
+    request = TrainingRequest(data=root, out=folder / "run", config=config, effects=effects, device="cpu")
     with pytest.MonkeyPatch.context() as patch, computing_fast():
         patch.setattr(review, "PLACES", PLACES)
         return load_run(run_training(request, Console(width=160)))
