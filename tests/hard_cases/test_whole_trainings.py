@@ -65,8 +65,8 @@ SURFACE_ONLY = {"train.sdf_steps": 400, "train.rays": 192, "train.material_steps
 def trained(look: Look, folder: Path, hdr: bool = True, changes: Mapping[str, object] | None = None) -> Run:
     """Write a capture, train it as `neilfpp train` does, and load the run.
 
-    Poses and exposures are not corrected, as `--effects auto` decides here; the evidence for the other effects
-    is not measured, which would take minutes.
+    Poses and exposures are not corrected, as `--effects auto` decides here; the evidence for the other
+    effects is not measured, which would take minutes.
     """
     root = write_capture(folder / "capture", look, hdr=hdr)
     config = changed(preset("fast"), {**SMALLER, **(changes or {})})
@@ -135,13 +135,51 @@ class Case:
 PAINT = KnownBall()
 MIRROR = KnownBall(roughness=0.08, metallic=1.0, base_color=gray(0.9))
 CASES = {
-    "paint": Case(PAINT, {}),
-    "paint, LDR": Case(PAINT, {}, hdr=False),
-    "mirror": Case(MIRROR, {}),
+    "paint": Case(
+        PAINT,
+        {
+            "outline": 0.038,
+            "normal": 15.0,
+            "position": 0.04,
+            "base_color": 0.12,
+            "roughness": 0.065,
+            "metallic": 0.075,
+            "image": 0.13,
+            "radiance": 0.16,
+        },
+    ),
+    # The roughness is not recovered: the highlight is over-exposed (docs/stability.md).
+    "paint, LDR": Case(
+        PAINT,
+        {
+            "outline": 0.038,
+            "normal": 15.0,
+            "position": 0.036,
+            "base_color": 0.17,
+            "metallic": 0.075,
+            "image": 0.13,
+            "radiance": 0.18,
+        },
+        hdr=False,
+    ),
+    # It is recovered as a blurred mirror, a half metal (docs/stability.md).
+    "mirror": Case(
+        MIRROR,
+        {
+            "outline": 0.042,
+            "normal": 12.0,
+            "position": 0.035,
+            "base_color": 0.16,
+            "roughness": 0.42,
+            "metallic": 0.63,
+            "image": 0.46,
+            "radiance": 0.45,
+        },
+    ),
 }
 THIN = {
     "thin plate": SurfaceErrors(outline=0.056, normal=16.0, position=0.03, color=0.0075),
-    "wire": SurfaceErrors(outline=0.16, normal=19.0, position=0.008, color=0.003),
+    "wire": SurfaceErrors(outline=0.26, normal=21.5, position=0.012, color=0.0033),
 }
 
 
