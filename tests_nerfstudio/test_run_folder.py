@@ -13,9 +13,12 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.plugin.model import NeilfMethod
-from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
+from neilfpp_method.schedule import Stage
+from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint, load_weights
 from neilfpp_method.train.health_record import read_findings
+from neilfpp_method.train.rerun import rerun_step
 from neilfpp_method.train.run import load_run, run_folder
+from neilfpp_method.train.skipped import load_step
 from tests.data.make_capture import make_capture
 from tests.train.small_runs import differences
 from tests_nerfstudio.runs import ns_train, small_settings, trainer_config, weights
@@ -68,17 +71,32 @@ def test_health_is_checked(run: Path) -> None:
         assert verdict_of(findings) in ("sound", "doubtful", "failed")
 
 
-def test_a_step_that_is_not_finite_is_skipped(data: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    losses = NeilfMethod.get_loss_dict
+def test_a_step_that_is_not_finite_is_skipped_and_can_be_repeated(
+    data: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    losses, terms = NeilfMethod.get_loss_dict, {}
 
     def spoilt(self: NeilfMethod, *arguments: object) -> dict[str, torch.Tensor]:
-        factor = torch.nan if self.training and self.step == 2 else 1.0
-        return {name: factor * loss for name, loss in losses(self, *arguments).items()}
+        weighted = losses(self, *arguments)
+        if not self.training or self.step != 6:
+            return weighted
+        terms.update({name: term.values.detach() for name, term in self.computed.terms.items()})
+        return {name: torch.nan * loss for name, loss in weighted.items()}
 
     monkeypatch.setattr(NeilfMethod, "get_loss_dict", spoilt)
     ended = ns_train(trainer_config(data, tmp_path, small_settings()))
     said = " ".join(capsys.readouterr().out.split())
-    assert "step 2 skipped: the gradient of" in said
-    assert "(1 skipped so far)" in said
+    assert "step 6 skipped: the gradient of" in said
+    assert "(1 skipped so far); see neilfpp replay" in said
     kept = weights(ended)
     assert all(value.isfinite().all() for value in kept.values() if isinstance(value, torch.Tensor))
+
+    skipped, model = load_step(ended / "neilfpp", 6), load_run(ended / "neilfpp").model
+    assert skipped.stage is Stage.MATERIAL_INIT
+    load_weights(model, skipped.model, ended)
+    model.train().freeze_for(skipped.stage)
+    torch.set_rng_state(skipped.random)
+    repeated = model.step(skipped.batch, skipped.stage).terms
+    for name, values in terms.items():
+        torch.testing.assert_close(repeated[name].values.detach(), values, msg=name)
+    assert rerun_step(ended / "neilfpp", 6).finite, "the fault was outside of the step"

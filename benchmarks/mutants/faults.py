@@ -155,8 +155,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "the signed distance has the wrong sign",
         "volume/density.py",
-        "scaled = sdf / beta\n",
-        "scaled = -sdf / beta\n",
+        "sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta\n    # Ψ",
+        "-sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta\n    # Ψ",
         "volume/test_density.py",
     ),
     Mutant(
@@ -197,8 +197,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "a distance of many β is NaN in half precision",
         "volume/density.py",
-        "scaled.clamp_max(0.0)\n    return",
-        "scaled - torch.relu(scaled)\n    return",
+        "sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta\n    # Ψ",
+        "sdf / beta\n    # Ψ",
         "hard_cases/test_properties.py",
     ),
     # Losses.

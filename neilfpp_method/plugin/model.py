@@ -52,6 +52,7 @@ from neilfpp_method.train.optimizer import (
     set_rates,
     waiting_fields,
 )
+from neilfpp_method.train.skipped import Moment
 from neilfpp_method.train.vanished import restore_surface
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
@@ -101,6 +102,7 @@ class NeilfMethod(Model):
         light_solver: finds the environment map and the lamps between steps.
         watch: the findings of the health checks.
         guard: skips steps that are not finite.
+        moment: the state before the current step, with which it can be repeated; None before training.
         record: writes the run folder; None before training, and if no folder can be written.
         computed: what the last step computed, until the light is solved; None otherwise.
         evidence: the evidence for lamps of the last fit that decided about them; None if none has.
@@ -134,7 +136,8 @@ class NeilfMethod(Model):
         self.light_solver = self.neilf.light_solver()
         seed_stream(settings.train.seed, Stream.HEALTH)
         self.watch = Watch(pixels.sample(CHECKED_PIXELS, gradients=False), CONSOLE.log)
-        self.guard = StepGuard(CONSOLE.log)
+        self.guard = StepGuard(self._report_skipped)
+        self.moment: Moment | None = None
         self.record: RunRecord | None = None
         self.computed: StepResult | None = None
         self.evidence: Evidence | None = None
@@ -307,12 +310,13 @@ class NeilfMethod(Model):
         if not self.training:
             return {"rgb": (outputs["rgb"] - batch["image"].to(self.device)).abs().mean()}
         pixels = to_pixel_batch(outputs["origins"], outputs["directions"], batch)
-        computed = self.neilf.step(pixels, self.stage)
+        position = stage_at(self.step, self.config.neilf.train)
+        self.moment = Moment.before_step(self.neilf, pixels, position, self.step)
+        computed = self.neilf.step(pixels, position.stage)
         terms = computed.terms
         self.computed = computed
-        share = stage_at(self.step, self.config.neilf.train).share
         weights = {
-            **active_losses(self.stage, self.neilf.config, self.neilf.stages, share),
+            **active_losses(position.stage, self.neilf.config, self.neilf.stages, position.share),
             OWN_LOSSES: self.config.host_losses,
         }
         total = weigh(terms, weights)
@@ -321,6 +325,12 @@ class NeilfMethod(Model):
             # Nerfstudio logs the metrics after this call, so the unweighted terms can be added here.
             metrics_dict |= total.terms | self._light_found()
         return {name: weigh({name: term}, weights).loss for name, term in terms.items()}
+
+    def _report_skipped(self, text: str) -> None:
+        """Log a step that was not finite, and store it in the run folder if there is one."""
+        if self.record is not None and self.moment is not None:
+            text += self.record.keep_skipped(self.neilf, self.moment)
+        CONSOLE.log(text)
 
     def _light_found(self) -> dict[str, Tensor]:
         """The evidence for lamps of the last fit, unless the settings decide about lamps."""

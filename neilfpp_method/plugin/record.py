@@ -21,6 +21,7 @@ from neilfpp_method.train.checkpoint import last_checkpoint, save_checkpoint
 from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.optimizer import make_optimizer
 from neilfpp_method.train.run import BESIDE_NERFSTUDIO, CaptureSource, create_run
+from neilfpp_method.train.skipped import Moment, keep_with_note
 
 __all__ = ["RunRecord", "no_record"]
 
@@ -36,7 +37,7 @@ def no_record(trainer: Trainer, host: str | None) -> str | None:
 
 @dataclass(frozen=True)
 class RunRecord:
-    """Writes the run folder of a training; settings and source are written with the first checkpoint.
+    """Writes the run folder of a training; settings and source are written first.
 
     Attributes:
         path: the run folder.
@@ -71,10 +72,23 @@ class RunRecord:
         Raises:
             UserError: if the folder cannot be written.
         """
-        if not (self.path / "config.json").is_file():
-            create_run(self.path, self.config, self.source, self.facts)
+        self._create()
         write_findings(self.path, watch)
         optimizer = make_optimizer(model, self.config.optimizer)
         for theirs in trainer.optimizers.optimizers.values():
             optimizer.state.update(theirs.state)
         save_checkpoint(last_checkpoint(self.path), model, light_solver, optimizer, steps)
+
+    def keep_skipped(self, model: NeilfModel, moment: Moment) -> str:
+        """Store a skipped step for `neilfpp replay`, and return the end of the message that reports it.
+
+        Raises:
+            UserError: if the run folder cannot be created.
+        """
+        self._create()
+        return keep_with_note(self.path, model, moment)
+
+    def _create(self) -> None:
+        """Write settings and source unless they have been written."""
+        if not (self.path / "config.json").is_file():
+            create_run(self.path, self.config, self.source, self.facts)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 
@@ -61,7 +60,7 @@ from neilfpp_method.train.optimizer import (
     waiting_fields,
 )
 from neilfpp_method.train.quality import read_checks, write_checks
-from neilfpp_method.train.skipped import Moment, keep_step
+from neilfpp_method.train.skipped import Moment, keep_with_note
 from neilfpp_method.train.training import Training
 from neilfpp_method.train.vanished import restore_surface
 from neilfpp_method.train.work_record import write_work
@@ -223,7 +222,7 @@ def _update(
 
 def _skip(run: Training, total: Total, norms: Mapping[str, float], moment: Moment) -> None:
     """Count, store and report a skipped step; raise `Diverged` after too many in a row."""
-    kept = _keep_skipped(run, moment)
+    kept = keep_with_note(run.path, run.model, moment) if run.fabric.is_global_zero else ""
     run.skipped += 1
     run.skipped_in_a_row += 1
     culprits = [name for name, value in total.terms.items() if not math.isfinite(value.item())]
@@ -242,17 +241,6 @@ def _skip(run: Training, total: Total, norms: Mapping[str, float], moment: Momen
             f"the last good checkpoint is kept in {last_checkpoint(run.path).parent}; look at the capture's "
             "brightest pixels or lower the learning rates",
         )
-
-
-def _keep_skipped(run: Training, moment: Moment) -> str:
-    """Store a skipped step and return the end of its message. A full disk does not stop the training."""
-    if not run.fabric.is_global_zero:
-        return ""
-    try:
-        kept = keep_step(run.path, run.model, moment)
-    except UserError as error:
-        return f"; the step is not stored: {error.problem}"
-    return f"; see neilfpp replay {shlex.quote(str(run.path))} {moment.step}" if kept else ""
 
 
 def _psnr(terms: LossTerms, units: RadianceUnits) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.tensor_file import read_tensor_file
 
-__all__ = ["FOLDER", "Moment", "SkippedStep", "keep_step", "load_step"]
+__all__ = ["FOLDER", "Moment", "SkippedStep", "keep_step", "keep_with_note", "load_step"]
 
 FOLDER = "skipped"
 MAX_KEPT = 4
@@ -107,6 +108,18 @@ def keep_step(run: Path, model: NeilfModel, moment: Moment) -> Path | None:
     with replacing(path) as temporary, temporary.open("wb") as file:
         torch.save(contents, file)
     return path
+
+
+def keep_with_note(run: Path, model: NeilfModel, moment: Moment) -> str:
+    """Store a step as `keep_step` does, and return the end of the message that reports it.
+
+    A full disk is reported in the message and does not stop the training.
+    """
+    try:
+        kept = keep_step(run, model, moment)
+    except UserError as error:
+        return f"; the step is not stored: {error.problem}"
+    return f"; see neilfpp replay {shlex.quote(str(run))} {moment.step}" if kept else ""
 
 
 def load_step(run: Path, step: int) -> SkippedStep:

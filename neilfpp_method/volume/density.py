@@ -24,7 +24,8 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
     """σ = α Ψ_β(−sdf), α = 1/β, Ψ_β the CDF of a zero-mean Laplace distribution (VolSDF eq. 2, 3).
 
     The density is 1/(2β) on the surface, 1/β deep inside and 0 far outside. All exponents are ≤ 0, so value
-    and gradients are finite for any distance, and small densities keep their relative precision.
+    and gradients are finite for any distance, and small densities keep their relative precision. 1/β² exceeds
+    the range of float16 below β = 4e-3, so half precision is computed in float32.
 
     Args:
         sdf: signed distance, negative inside, scene units.
@@ -33,11 +34,12 @@ def laplace_density(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]
     Returns:
         Density, 1 / scene unit.
     """
-    scaled = sdf / beta
+    scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
     # Ψ(−x) = ½ (e^{−max(x, 0)} − expm1(min(x, 0))). relu has slope 0 at 0 and clamp_max slope 1, so
-    # the slope of Ψ there is −½. scaled − outside would be NaN if the quotient overflows (float16).
+    # the slope of Ψ there is −½. scaled − outside would be NaN if the quotient overflows.
     outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
-    return 0.5 * (torch.exp(-outside) - torch.expm1(inside)) / beta
+    density = 0.5 * (torch.exp(-outside) - torch.expm1(inside)) / beta
+    return density.to(torch.result_type(sdf, beta))
 
 
 def laplace_depth(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
 from fractions import Fraction
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 import tifffile
 
+from neilfpp_method.data import raw
 from neilfpp_method.data.bracket_folder import find_brackets, merge_brackets
 from neilfpp_method.data.images import read_image
 from neilfpp_method.data.raw import develop
@@ -122,15 +121,45 @@ def test_without_rawpy_the_extra_is_named(tmp_path: Path, monkeypatch) -> None:
         develop(tmp_path / "a.nef")
 
 
-def test_an_image_of_another_size_than_its_sensor_is_named(tmp_path: Path, monkeypatch) -> None:
-    raw = SimpleNamespace(
-        raw_image_visible=np.zeros((4, 6)),
-        daylight_whitebalance=[1.0, 1.0, 1.0, 1.0],
-        postprocess=lambda **options: np.zeros((6, 4, 3), np.uint16),
-    )
-    library = ModuleType("rawpy")
-    library.imread = lambda path: nullcontext(raw)
-    library.ColorSpace, library.HighlightMode = SimpleNamespace(sRGB=1), SimpleNamespace(Clip=0)
-    monkeypatch.setitem(sys.modules, "rawpy", library)
-    with pytest.raises(UserError, match=r"a\.raf: 4×6 pixels from a sensor of 6×4"):
+STAND_IN = """
+import os, time
+from contextlib import nullcontext
+from types import SimpleNamespace
+import numpy as np
+
+class Raw:
+    raw_image_visible, white_level = np.zeros((4, 6)), 1
+    daylight_whitebalance = camera_whitebalance = [1.0, 1.0, 1.0, 1.0]
+
+    def postprocess(self, **options):
+        {decoding}
+        return np.zeros((6, 4, 3), np.uint16)
+
+def imread(path):
+    return nullcontext(Raw())
+
+ColorSpace, HighlightMode = SimpleNamespace(sRGB=1), SimpleNamespace(Clip=0)
+"""
+"""A module rawpy whose images have another size than their sensor, unless decoding ends before."""
+
+
+@pytest.mark.parametrize(
+    ("decoding", "problem"),
+    [
+        ("pass", "4×6 pixels from a sensor of 6×4"),
+        ("os.abort()", r"cannot be developed \(LibRaw ended by signal 6\)"),
+        ("os._exit(3)", r"cannot be developed \(LibRaw ended by status 3\)"),
+        ("raise MemoryError", r"cannot be developed \(MemoryError\)"),
+        ("np.zeros(1 << 33, np.uint8)", r"cannot be developed \(Unable to allocate 8.00 GiB"),
+        ("time.sleep(600)", r"cannot be developed \(LibRaw did not finish within 2 s\)"),
+    ],
+    ids=["size", "crash", "exit", "error", "memory", "hang"],
+)
+def test_a_decoder_that_fails_ends_with_one_line(tmp_path: Path, monkeypatch, decoding, problem) -> None:
+    (tmp_path / "rawpy.py").write_text(STAND_IN.format(decoding=decoding))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    if "sleep" in decoding:
+        monkeypatch.setattr(raw, "SECONDS", 2.0)
+    with pytest.raises(UserError, match=rf"a\.raf: {problem}"):
         develop(tmp_path / "a.raf")
