@@ -65,6 +65,8 @@ UNUSABLE = (
     ),
 )
 
+FARTHEST = 1e6
+"""Largest distance of a camera from the scene box, in scene units; float32 has a step of 0.06 there."""
 BOX_SOURCES: Mapping[SceneSource, str] = {
     "box": ", as stated by the capture",
     "points": ", computed from the points",
@@ -219,6 +221,7 @@ def load_capture(
         raise UserError(f"{root}: not a capture of the format {format}", f"it needs {READERS[format].LAYOUT}")
     files = READERS[format].read(root)
     floating = _check_views(files.views)
+    _check_box(root, files)
     hdr = floating if files.hdr is None else files.hdr
     return Capture(
         root=root,
@@ -302,6 +305,18 @@ def _check_views(views: Sequence[View]) -> bool:
             f"{by_kind[True].image} is HDR and {by_kind[False].image} is LDR", "use images of one kind"
         )
     return next(iter(by_kind))
+
+
+def _check_box(root: Path, files: CaptureFiles) -> None:
+    """Check that the cameras are near the scene box, so that rays can be computed in float32."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        shifts = np.stack([files.normalization.camera(view.camera).w2c[:3, 3] for view in files.views])
+        distance = np.linalg.norm(shifts, axis=1).max()
+    if not distance <= FARTHEST:
+        raise UserError(
+            f"{root}: a camera is {distance:.3g} times the radius of the scene box away from it",
+            "correct the centre and the radius of the scene box",
+        )
 
 
 def _check_view(view: View) -> None:

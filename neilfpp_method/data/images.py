@@ -22,6 +22,7 @@ from PIL import Image
 from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.exr import exr_header, exr_samples
 from neilfpp_method.data.image_parts import ImageHeader, rgb_of_opencv
+from neilfpp_method.data.png import check_png_chunks
 from neilfpp_method.data.radiance_hdr import hdr_header, hdr_samples
 from neilfpp_method.data.tiff import tiff_header, tiff_samples
 from neilfpp_method.errors import UserError
@@ -96,6 +97,7 @@ def _opencv_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
 
 
 def _png_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
+    check_png_chunks(path)
     with Image.open(path, formats=PILLOW_FORMATS) as image:
         if "transparency" in image.info and image.mode in ("P", "L", "1"):
             # OpenCV ignores the transparent colours of palettes and of grey images.

@@ -149,6 +149,8 @@ def view(content: dict) -> dict:
         (lambda c: c.update(views=3), "views: not a JSON list"),
         (lambda c: c["scene"].update(radius=0), "scene.radius: not positive"),
         (lambda c: c["scene"].update(centre=[1, 2]), "scene.centre: not 3 finite numbers"),
+        (lambda c: c["scene"].update(centre=[1, 2, 1e308]), "times the radius of the scene box away"),
+        (lambda c: c["scene"].update(radius=1e-9), "times the radius of the scene box away"),
         (lambda c: c.update(test=["999"]), "there is no view '999'"),
         (lambda c: c.update(test=[f"{i:03d}" for i in range(6)]), "all 6 views are held out"),
         (lambda c: c.update(point_cloud="gone.ply"), "point_cloud: there is no"),

@@ -364,6 +364,24 @@ def test_a_forged_size_is_refused_before_anything_is_allocated(tmp_path: Path) -
         read_image(tmp_path / "a.png")
 
 
+def test_a_png_chunk_that_is_longer_than_the_file_is_not_decoded(tmp_path: Path, monkeypatch) -> None:
+    """OpenCV would allocate the stated length of a gigabyte before it reads."""
+    path = tmp_path / "a.png"
+    write_png(path, BYTES)
+    whole = path.read_bytes()
+    at = whole.index(b"IDAT")
+    path.write_bytes(whole[: at - 4] + struct.pack(">I", 2**30) + whole[at:])
+    monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("decoded"))
+    with pytest.raises(UserError, match=r"a\.png: cannot be read \(a chunk is longer than the file\)"):
+        read_image(path)
+    path.write_bytes(whole[:-3])
+    with pytest.raises(UserError, match="a chunk is longer than the file"):
+        read_image(path)
+    path.write_bytes(whole[: -8 - 4 + 3])
+    with pytest.raises(UserError, match="it ends within the head of a chunk"):
+        read_image(path)
+
+
 def test_a_header_of_100_000_columns_costs_no_memory(tmp_path: Path) -> None:
     write_exr(tmp_path / "wide.exr", {"RGB": RGB})
     data = bytearray((tmp_path / "wide.exr").read_bytes())
