@@ -93,8 +93,8 @@ def _decode(path: Path, out: Path) -> None:
         status = subprocess.run(command, stdin=quiet, stdout=quiet, stderr=quiet, timeout=SECONDS).returncode
         if status == 0:
             return
-        told, how = out.with_suffix(".txt"), f"signal {-status}" if status < 0 else f"status {status}"
-        reason = told.read_text("utf-8") if told.exists() else f"LibRaw ended by {how}"
+        message, how = out.with_suffix(".txt"), f"signal {-status}" if status < 0 else f"status {status}"
+        reason = message.read_text("utf-8") if message.exists() else f"LibRaw ended by {how}"
     except subprocess.TimeoutExpired:
         reason = f"LibRaw did not finish within {SECONDS:.0f} s"
     raise UserError(f"{path}: cannot be developed ({reason})", "convert it to DNG, or to linear EXR")

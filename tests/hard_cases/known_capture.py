@@ -48,8 +48,8 @@ def look_at_shape(shape: Distance) -> Look:
     """The look of a shape with an exact distance, whose radiance depends on position and normal only."""
 
     def look(origins: Array, directions: Array) -> tuple[Array, Array]:
-        seen = meet(shape, origins, directions)
-        return seen.hit, seen.color
+        hits = meet(shape, origins, directions)
+        return hits.hit, hits.color
 
     return look
 
