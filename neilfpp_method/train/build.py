@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -170,7 +171,10 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
     if config.host.kind != "volsdf" or config.loss.point_cloud == 0.0:
         return None
     if capture.point_cloud is None:
-        return "point cloud: the capture has none with normals, so geometry is found from the images alone"
+        return (
+            "point cloud: the capture has none with normals, so geometry is found from the images alone; "
+            f"neilfpp prepare {shlex.quote(str(capture.root))} --out CAPTURE computes one and keeps the poses"
+        )
     used = f"point cloud: {capture.point_cloud.name} supervises the geometry"
     return f"{used}; --config.loss.point-cloud 0 switches this off"
 

@@ -41,7 +41,7 @@ def test_a_capture_without_a_cloud_has_no_loss_on_it(capture):
     config = changed(tiny_config(), {"loss.point_cloud": 0.1})
     model, pixels = built(without, config)
     assert "point_cloud" not in model.losses(pixels.sample(8), Stage.SDF_INIT)
-    assert "from the images alone" in cloud_summary(without, config)
+    assert f"neilfpp prepare {without.root} --out CAPTURE" in cloud_summary(without, config)
 
 
 def test_no_message_if_the_settings_use_no_cloud(capture):
