@@ -177,16 +177,18 @@ class Capture:
                 f"point cloud: {self.point_cloud.name if self.point_cloud else 'none'}",
                 f"scene: centre ({x:.3g}, {y:.3g}, {z:.3g}), 1 scene unit = {self.normalization.scale:.4g} "
                 "world units" + BOX_SOURCES[self.scene_from],
-                *self._missing_text(),
+                *(f"warning: {remark}" for remark in self.remarks),
             ]
         )
 
-    def _missing_text(self) -> list[str]:
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know about the files of the capture: listed images that are missing."""
         if not self.missing:
-            return []
+            return ()
         listed = len(self.views) + len(self.missing)
         count = f"{len(self.missing)} of {listed} listed images are missing and left out"
-        return [f"warning: {count}; the first is {self.missing[0]}"]
+        return (f"{count}; the first is {self.missing[0]}",)
 
 
 def load_capture(

@@ -152,7 +152,7 @@ def _from_capture(capture: Capture, options: Prepare) -> PoseSource:
     points = None
     if capture.format == "colmap":
         points = sparse_points(open_model(model_folder(capture.root)))
-    return PoseSource(posed, step, points)
+    return PoseSource(posed, step, points, remarks=capture.remarks)
 
 
 def _from_photos(photos: Photos, brackets: Brackets | None, options: Prepare, open_bar: Bars) -> PoseSource:

@@ -115,6 +115,9 @@ def lay_out(source: PoseSource, options: Prepare, open_bar: Bars) -> Summary | N
         inspection = inspect_capture(prepared) if rejected else inspection
     source = replace(source, remarks=(*source.remarks, *remarks))
     cloud = _cloud(source, prepared, options, step, open_bar)
+    if prepared.scene_from == "cameras" and len(cloud.points.position):
+        box = find_box(prepared.views, cloud.points.position)
+        prepared = replace(prepared, normalization=box.normalization, scene_from=box.source)
     summary = _publish(source, prepared, cloud, problems(inspection), options)
     last.complete({})
     return summary

@@ -16,6 +16,7 @@ from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.images import read_image, write_exr, write_png
 from neilfpp_method.data.point_cloud import read_oriented_ply
 from neilfpp_method.data.raw import Developed
+from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.prepare import command
 from neilfpp_method.prepare import photos as photo_files
 from tests.data.make_capture import make_capture
@@ -268,6 +269,23 @@ def test_a_capture_with_poses_keeps_them(tmp_path):
         np.testing.assert_array_equal(view.camera.w2c, old.camera.w2c)
         assert view.mask.is_file()
         assert (read_image(view.image).pixels == read_image(old.image).pixels).all()
+
+
+def test_poses_without_points_get_a_dense_cloud_and_a_box_from_it(prepared, tmp_path, capsys):
+    root = tmp_path / "posed"
+    shutil.copytree(prepared / "nerfstudio", root)
+    content = json.loads((root / "transforms.json").read_text())
+    for entry in ("scene", "ply_file_path"):
+        content.pop(entry)
+    (root / "transforms.json").write_text(json.dumps(content))
+    (root / content["frames"][3]["file_path"]).unlink()
+    assert load_capture(root).scene_from == "cameras"
+    assert prepare(root, tmp_path / "out", "--cloud", "dense") == 0
+    capture = load_capture(tmp_path / "out")
+    points = read_oriented_ply(capture.point_cloud).position
+    assert capture.scene_from in ("points", "focus")
+    assert capture.normalization == find_box(capture.views, points).normalization
+    assert f"1 of {VIEWS} listed images are missing and left out" in capsys.readouterr().out
 
 
 def test_a_test_view_that_auto_leaves_out_is_no_test_view_of_the_capture(tmp_path):
