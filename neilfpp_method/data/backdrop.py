@@ -49,15 +49,16 @@ def border_color(pixels: PixelDataset) -> Float[Tensor, " 3"] | None:
     the sky. Pixels that a mask assigns to the object do not count.
     """
     numbers = border(pixels.store)
-    color = border_median(pixels)
     if not len(numbers):
         return None
+    colors = pixels.store.colors(numbers, pixels.store.views_of(numbers))
+    color = pixels.linear(colors).median(dim=0).values
     tolerance = BORDER_TOLERANCE * max(float(color.max()), pixels.median_radiance())
 
-    def differs(colors: Float32[np.ndarray, "N 3"]) -> Bool[Tensor, " N"]:
-        return (pixels.linear(colors) - color).abs().amax(dim=-1) > tolerance
+    def differs(values: Float32[np.ndarray, "N 3"]) -> Bool[Tensor, " N"]:
+        return (pixels.linear(values) - color).abs().amax(dim=-1) > tolerance
 
-    others = numbers[differs(border_colors(pixels)).numpy()]
+    others = numbers[differs(colors).numpy()]
     if len(others) > (1 - BORDER_SHARE) * len(numbers):
         return None
     if len(others) <= MIN_OTHER_SHARE * len(numbers):
