@@ -21,7 +21,7 @@ from rich.table import Table
 
 from benchmarks.command import run_benchmark
 from benchmarks.measure import Measurement, hardware
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.json_files import read_json
 

@@ -28,7 +28,7 @@ from scipy.ndimage import binary_erosion
 from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware
 from neilfpp_method.commands.command import progress_bar
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.export.asset.command import AssetOptions, check_asset, export_asset

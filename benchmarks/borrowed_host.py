@@ -25,7 +25,7 @@ from benchmarks.measure import hardware, revision
 from benchmarks.tables import RESULTS, Result, Row, markdown, write_result
 from neilfpp_method.attach import AttachedNeilf, attach_neilf
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate

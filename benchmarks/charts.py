@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.drawing.ink import PALE_INK, PAPER, write
 
 __all__ = ["Chart", "Line", "draw_charts"]

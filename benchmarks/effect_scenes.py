@@ -28,9 +28,9 @@ from scipy import ndimage
 
 from benchmarks.command import run_benchmark
 from benchmarks.mitsuba_scene import Lamp, LitScene, Part, PathSampling, load_mitsuba, render
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import write_exr, write_png
+from neilfpp_method.data.files.json_entry import write_json
 
 __all__ = ["SCENES", "KnownScene", "write_capture"]
 

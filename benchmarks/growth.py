@@ -26,7 +26,7 @@ from benchmarks.charts import Chart, Line, draw_charts
 from benchmarks.joint import fitted_model, rays_at_the_table, step_on
 from benchmarks.measure import clock, device, hardware
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel

@@ -18,7 +18,7 @@ from rich.console import Console
 from torch import Tensor
 
 from benchmarks.command import run_benchmark
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.views import KnownView, known_test_views
 from neilfpp_method.structures import Material

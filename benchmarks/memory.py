@@ -28,10 +28,10 @@ from rich.console import Console
 
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import RESULTS, Result, Row, markdown, write_result
-from neilfpp_method.data.camera import scaled_camera
+from neilfpp_method.data.cameras.camera import scaled_camera
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.capture_folder import write_capture
-from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.train.command import run_training

@@ -15,7 +15,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.errors import UserError
 
 __all__ = ["Lamp", "LitScene", "Part", "PathSampling", "load_mitsuba", "render"]

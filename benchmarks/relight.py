@@ -28,7 +28,7 @@ from torch import Tensor
 from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware
 from benchmarks.mitsuba_scene import LitScene, Part, PathSampling, load_mitsuba, render
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene
 from neilfpp_method.relight.sky import Sky

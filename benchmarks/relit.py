@@ -31,9 +31,9 @@ from torch import Tensor
 from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.mesh import Mesh
-from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.mesh import MeshHost

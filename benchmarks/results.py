@@ -28,7 +28,7 @@ from torch import Tensor
 from benchmarks.command import run_benchmark
 from benchmarks.measure import hardware, revision
 from benchmarks.tables import COLUMNS, RESULTS, Result, Row, markdown, write_result
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.report.write import REPORT, write_report

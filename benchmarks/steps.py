@@ -16,7 +16,7 @@ from pathlib import Path
 
 from benchmarks.measure import Measurement, device, in_yardsticks
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh

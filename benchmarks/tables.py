@@ -25,7 +25,7 @@ from pathlib import Path
 import tyro
 
 from benchmarks.command import run_benchmark
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 
 __all__ = ["COLUMNS", "Result", "Row", "filled", "markdown", "read_results", "write_result"]

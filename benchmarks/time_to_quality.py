@@ -25,7 +25,7 @@ from benchmarks.charts import Chart, Line, draw_charts
 from benchmarks.command import run_benchmark
 from benchmarks.measure import clock, hardware
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.evaluate.map_metrics import image_metrics, material_metrics
 from neilfpp_method.evaluate.views import known_test_views, render_test_views
 from neilfpp_method.kernels.process import computing_fast

@@ -20,7 +20,7 @@ from rich.console import Console
 from torch import Tensor
 
 from benchmarks.command import run_benchmark
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.scene_metrics import light_metrics

@@ -16,7 +16,7 @@ from nerfstudio.models.neus import NeuSModelConfig
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
 

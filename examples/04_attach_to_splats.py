@@ -11,8 +11,8 @@ from torch.nn.functional import normalize
 
 from neilfpp_method import attach_neilf, preset
 from neilfpp_method.attach import pixel_batch
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.hosts.image import image_hits
 from neilfpp_method.settings.types import LightFitConfig
 

@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.environment_map import read_environment
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.environment_map import read_environment
 from neilfpp_method.effects.place_solver import PlaceSolver
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health

@@ -18,7 +18,7 @@ from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
 from neilfpp_method.commands.ending import CLOSED_OUTPUT, ended_by_signal, output_is_closed
 from neilfpp_method.commands.mistakes import TYRO_UNKNOWN, closest, mistake
-from neilfpp_method.data.native_signals import sigterm_delayed
+from neilfpp_method.data.cameras.native_signals import sigterm_delayed
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]

@@ -103,8 +103,8 @@ class PixelBatch(Indexable):
             (sRGB) for an LDR capture.
         mask: 1 on the object, 0 off it. Meaningful only where `mask_known` is positive.
         mask_known: weight of the mask. 1 everywhere if the capture has masks. Without masks it is
-            `data.pixels.BACKGROUND_TRUST` at pixels that show exactly the background colour, and 0 at all
-            others, whose `mask` is 1.
+            `data.pixels.dataset.BACKGROUND_TRUST` at pixels that show exactly the background colour, and 0
+            at all others, whose `mask` is 1.
         image_gradient: length of the gradient of the image's luminance by Scharr's filter without
             normalization, that is 32 times the change per pixel; 0 if no loss needs it.
         view: index of the training view.

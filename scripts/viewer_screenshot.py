@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.browser import open_page
 from neilfpp_method.view.subject import subject_of

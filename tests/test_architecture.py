@@ -179,9 +179,9 @@ def test_modules_are_short(source):
         ("hosts.volsdf", "hosts.base", False),
         ("losses", "hosts.base", True),
         ("incident", "hosts.volsdf", True),
-        ("data.pixels", "shading.color", False),
-        ("data.pixels", "shading.brdf", True),
-        ("data.pixels", "settings.types", True),
+        ("data.pixels.dataset", "shading.color", False),
+        ("data.pixels.dataset", "shading.brdf", True),
+        ("data.pixels.dataset", "settings.types", True),
         ("prepare.command", "data.capture", False),
         ("prepare.command", "evaluate.pictures", True),
         ("train.loop", "prepare.command", True),
@@ -203,5 +203,5 @@ def test_the_order_is_checked_in_both_directions(module, imported, wrong):
 
 def test_imports_are_found_at_any_place():
     text = "import a.b\nfrom neilfpp_method import losses\n"
-    text += "def f():\n  from neilfpp_method.data.images import write_png"
-    assert list(imports(ast.parse(text))) == ["a.b", f"{PACKAGE}.losses", f"{PACKAGE}.data.images"]
+    text += "def f():\n  from neilfpp_method.data.files.images import write_png"
+    assert list(imports(ast.parse(text))) == ["a.b", f"{PACKAGE}.losses", f"{PACKAGE}.data.files.images"]

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.capabilities import missing_capabilities
 from neilfpp_method.hosts.function import CallableHost

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts import foreign
 from neilfpp_method.hosts.function import CallableHost

@@ -14,7 +14,7 @@ import torch
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
 from neilfpp_method.cli import main
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.kernels import encode, grid_spec
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS

@@ -14,8 +14,8 @@ from rich.console import Console
 
 from neilfpp_method.cli import main
 from neilfpp_method.commands import COMMANDS
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.native_signals import sigterm_delayed
+from neilfpp_method.data.cameras.native_signals import sigterm_delayed
+from neilfpp_method.data.files.atomic_file import replacing
 
 
 @dataclass

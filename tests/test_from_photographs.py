@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.settings.presets import PRESETS
 from tests.prepare.textured_corner import make_photos
 from tests.train.small_runs import small_config, solved_light

@@ -14,7 +14,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 
-from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.schedule import stage_steps
 from neilfpp_method.settings.presets import preset

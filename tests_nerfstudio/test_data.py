@@ -15,13 +15,13 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.process_data.colmap_utils import colmap_to_json
 
+from neilfpp_method.data.cameras.lens import Lens
+from neilfpp_method.data.cameras.projection import camera_rays, project
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.capture_folder import write_capture
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.data.formats.write_transforms import write_transforms
-from neilfpp_method.data.images import write_png
-from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import camera_rays, project
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.datamanager import CaptureDataManagerConfig, CaptureDataset, to_pixel_batch
 from neilfpp_method.plugin.dataparser import CaptureParserConfig, capture_of

@@ -16,7 +16,7 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender
 from nerfstudio.utils.eval_utils import eval_setup
 
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.kernels.process import computing_fast

@@ -21,9 +21,9 @@ from neilfpp_method.compare.figures import SHOWN, figure_rows, figures_parts
 from neilfpp_method.compare.parts import TablePart, runs_part, seconds_part, settings_part
 from neilfpp_method.compare.runs import ComparedRun, read_compared_runs
 from neilfpp_method.compare.sheet import Column, comparison_sheet
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.images import write_png
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.images import write_png
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.report.measured import count_of_views
 from neilfpp_method.report.views import MAX_SIZE, MAX_VIEWS, MIN_SIZE, ComparedViews, compare_views

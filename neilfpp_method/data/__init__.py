@@ -1,1 +1,1 @@
-"""Captures in: readers, images, point clouds, the pixel dataset and the ground truth."""
+"""Read captures: views, split, scene box, point cloud, pixels and ground truth."""

@@ -15,12 +15,12 @@ from typing import Literal, Protocol
 import numpy as np
 
 from neilfpp_method.data import capture_folder
-from neilfpp_method.data.camera import Camera, check_camera
+from neilfpp_method.data.cameras.camera import Camera, check_camera
+from neilfpp_method.data.files.image_parts import ImageHeader
+from neilfpp_method.data.files.images import IMAGE_SUFFIXES, image_header
+from neilfpp_method.data.files.paths import plain_name
+from neilfpp_method.data.files.raw import RAW_SUFFIXES
 from neilfpp_method.data.formats import blender, colmap, dtu, nerfactor, nero, sfm_scene, transforms
-from neilfpp_method.data.image_parts import ImageHeader
-from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
-from neilfpp_method.data.paths import plain_name
-from neilfpp_method.data.raw import RAW_SUFFIXES
 from neilfpp_method.data.split import held_out_views
 from neilfpp_method.data.views import CaptureFiles, Normalization, SceneSource, View
 from neilfpp_method.errors import UserError

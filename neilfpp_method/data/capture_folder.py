@@ -11,10 +11,10 @@ from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.json_entry import Entry, write_json
-from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.paths import inside
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.lens import Lens
+from neilfpp_method.data.files.json_entry import Entry, write_json
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.views import CaptureFiles, Normalization, SceneSource, View
 from neilfpp_method.errors import UserError
 

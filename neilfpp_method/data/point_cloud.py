@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from neilfpp_method.data.ply import CODES_BY_NAME, NORMAL, POSITION, write_ply
+from neilfpp_method.data.files.ply import CODES_BY_NAME, NORMAL, POSITION, write_ply
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.structures import OrientedPoints

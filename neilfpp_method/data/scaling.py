@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped
 
-from neilfpp_method.data.camera import scaled_camera
+from neilfpp_method.data.cameras.camera import scaled_camera
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

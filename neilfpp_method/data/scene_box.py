@@ -16,9 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from neilfpp_method.data.camera import POSE_MISTAKES, check_camera
+from neilfpp_method.data.cameras.camera import POSE_MISTAKES, check_camera
 from neilfpp_method.data.focus import axes_of, find_focus, meeting_point
-from neilfpp_method.data.silhouettes import AGREEMENT, Outline, agreement, read_outlines
+from neilfpp_method.data.hulls.silhouettes import AGREEMENT, Outline, agreement, read_outlines
 from neilfpp_method.data.views import Normalization, SceneSource, View
 from neilfpp_method.errors import UserError
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from neilfpp_method.data.paths import inside
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError
 

@@ -23,10 +23,10 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
+from neilfpp_method.data.files.number_arrays import arrays_of_archive
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.mesh import Mesh, read_mesh
-from neilfpp_method.data.number_arrays import arrays_of_archive
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scaling import area_average, area_share, file_size, nearest
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

@@ -19,9 +19,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import project
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import project
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
 from neilfpp_method.structures import OrientedPoints

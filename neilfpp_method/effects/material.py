@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.material_grid import ROUGHNESSES
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.noise import lobe_noise

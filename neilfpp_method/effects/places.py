@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import pixel_index, project
+from neilfpp_method.data.cameras.projection import pixel_index, project
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.lighting.layered_transport import SharedPoints
 from neilfpp_method.model import NeilfModel

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.pose_fit import fit_poses, pixel_errors
 from neilfpp_method.fields.poses import PoseMotion

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.exposure import Exposures
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light

@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.evaluate.outgoing import radiance_parts, sent_by_patch
 from neilfpp_method.evaluate.patches import PATCHES, by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.posterior import Deviation, Observations, expected_error, prior_error

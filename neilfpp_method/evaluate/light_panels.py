@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.evaluate.contact_sheet import Group, PictureRow, Section
 from neilfpp_method.evaluate.pictures import (

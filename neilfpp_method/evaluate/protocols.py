@@ -25,7 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.evaluate.map_metrics import (

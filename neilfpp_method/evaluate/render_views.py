@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.evaluate.confidence import measure_residuals, with_deviation
 from neilfpp_method.evaluate.pictures import display
 from neilfpp_method.evaluate.views import RenderedView, render_view

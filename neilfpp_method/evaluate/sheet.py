@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.evaluate.confidence import DISPLAY_STEP, measure_residuals, with_deviation
 from neilfpp_method.evaluate.contact_sheet import contact_sheet
 from neilfpp_method.evaluate.light_panels import light_sections

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from neilfpp_method.data.cameras.projection import pixel_index, project
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import pixel_index, project
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.fields.exposure import at_mean_exposure
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.shading.color import CLIPPED

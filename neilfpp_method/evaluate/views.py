@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from neilfpp_method.data.cameras.projection import camera_rays, pixel_index, project
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import camera_rays, pixel_index, project
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.split import TEST_EVERY
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View

@@ -17,8 +17,8 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.data.images import write_exr
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.images import write_exr
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.probes import probe, spread_over_surface
 from neilfpp_method.fields.environment import EnvironmentLight

@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.data.ply import NORMAL, write_ply
+from neilfpp_method.data.files.ply import NORMAL, write_ply
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.surface_cache import extracted_surface
 from neilfpp_method.hosts.base import HasSdf

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields.direction_map import map_directions
 from neilfpp_method.structures import OrientedPoints

@@ -19,8 +19,8 @@ from jaxtyping import Float, Float32, Int32
 from torch import Tensor
 
 from neilfpp_method import __version__
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.number_arrays import arrays_of_archive
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.number_arrays import arrays_of_archive
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.extract import extract_mesh
 from neilfpp_method.hosts.base import HasSdf, SmoothsNormals

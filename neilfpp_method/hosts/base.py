@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import Parameter
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.schedule import StageTable
 from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLight, SurfaceHits
 

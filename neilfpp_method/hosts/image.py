@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import RayBatch, SurfaceHits

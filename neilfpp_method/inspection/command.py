@@ -10,10 +10,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.text import Text
 
-from neilfpp_method.data.atomic_file import replacing
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_png
-from neilfpp_method.data.object_source import object_line
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.images import write_png
+from neilfpp_method.data.pixels.object_source import object_line
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import EarlyEnd
 from neilfpp_method.inspection.defects import Inspection, inspect_capture

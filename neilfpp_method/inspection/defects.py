@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from neilfpp_method.data.camera import POSE_MISTAKES
+from neilfpp_method.data.cameras.camera import POSE_MISTAKES
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.inverted_masks import look_inverted
+from neilfpp_method.data.hulls.inverted_masks import look_inverted
+from neilfpp_method.data.hulls.silhouettes import Outline
 from neilfpp_method.data.point_cloud import load_point_cloud
-from neilfpp_method.data.silhouettes import Outline
 from neilfpp_method.errors import UserError
 from neilfpp_method.inspection.measure import ViewFigures, measure
 from neilfpp_method.inspection.radiance import RadianceQuality, radiance_quality

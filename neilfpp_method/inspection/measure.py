@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32
 
-from neilfpp_method.data.images import ImageFile, read_image
-from neilfpp_method.data.object_source import ObjectSource
-from neilfpp_method.data.pixel_store import BORDER_SHARE
-from neilfpp_method.data.silhouettes import Outline, outline_of
-from neilfpp_method.data.view_pixels import pixel_colors, read_mask
+from neilfpp_method.data.files.images import ImageFile, read_image
+from neilfpp_method.data.hulls.silhouettes import Outline, outline_of
+from neilfpp_method.data.pixels.object_source import ObjectSource
+from neilfpp_method.data.pixels.store import BORDER_SHARE
+from neilfpp_method.data.pixels.view_pixels import pixel_colors, read_mask
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, luminance, srgb_to_linear

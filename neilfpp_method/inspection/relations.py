@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.projection import project
 
 __all__ = ["CameraPlacement", "camera_placement", "duplicates", "exposure_factors"]
 

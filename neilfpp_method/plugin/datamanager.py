@@ -15,9 +15,9 @@ from nerfstudio.data.pixel_samplers import PixelSampler, PixelSamplerConfig
 from nerfstudio.model_components.ray_generators import RayGenerator
 from torch import Tensor
 
-from neilfpp_method.data import drawing
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import CameraRays
+from neilfpp_method.data.cameras.projection import CameraRays
+from neilfpp_method.data.pixels import drawing
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.plugin.dataparser import capture_of
 from neilfpp_method.structures import PixelBatch
@@ -104,7 +104,7 @@ def to_pixel_batch(origins: Tensor, directions: Tensor, batch: dict[str, Any]) -
 
 
 class CapturePixelSampler(PixelSampler):
-    """Draws the same pixels as `PixelDataset.sample` (`data.drawing`) with the same random numbers.
+    """Draws the same pixels as `PixelDataset.sample` (`data.pixels.drawing`) with the same random numbers.
 
     A step thus trains on the same pixels as the corresponding step of the standalone loop.
     """

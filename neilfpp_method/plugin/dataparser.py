@@ -17,11 +17,11 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserCo
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 
-from neilfpp_method.data.camera import Camera, check_camera
+from neilfpp_method.data.cameras.camera import Camera, check_camera
 from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.files.images import image_header
 from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, lens_from_nerfstudio, nerfstudio_coefficients
 from neilfpp_method.data.formats.transforms import FLIP
-from neilfpp_method.data.images import image_header
 from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.errors import UserError
 

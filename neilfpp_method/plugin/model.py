@@ -16,7 +16,7 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.material_search import is_search_due
 from neilfpp_method.effects.plan import Plan

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.cameras.colmap_library import pycolmap
 
 __all__ = ["in_background", "sigterm_as_ctrl_c", "silent"]
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from neilfpp_method.data.bracket_folder import Brackets
+from neilfpp_method.data.brackets.folder import Brackets
 from neilfpp_method.data.capture import READERS, Capture, load_capture, refuse_run
 from neilfpp_method.data.formats.colmap import model_folder, open_model
 from neilfpp_method.data.formats.copies import writing

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.prepare.depth_planes import OrientedDepth, fit_planes
 

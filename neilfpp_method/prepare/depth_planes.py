@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 
 __all__ = ["OrientedDepth", "fit_planes"]
 

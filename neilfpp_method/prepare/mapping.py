@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.cameras.colmap_library import pycolmap
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.background import in_background
 from neilfpp_method.prepare.photos import Photo

@@ -14,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.colmap_library import pycolmap
-from neilfpp_method.data.images import image_header
+from neilfpp_method.data.cameras.colmap_library import pycolmap
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.images import image_header
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.background import in_background
 from neilfpp_method.prepare.photos import Photo

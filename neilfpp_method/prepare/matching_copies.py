@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.photos import Photo, Photos, read_photo
 from neilfpp_method.shading.color import tone_map

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from neilfpp_method.data.bracket_folder import GROUPS, Brackets, find_brackets, merge_brackets
-from neilfpp_method.data.json_entry import Entry, write_json
-from neilfpp_method.data.photo_exposure import LISTS
+from neilfpp_method.data.brackets.folder import GROUPS, Brackets, find_brackets, merge_brackets
+from neilfpp_method.data.brackets.photo_exposure import LISTS
+from neilfpp_method.data.files.json_entry import Entry, write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.photos import MIN_PHOTOS, Photos, check_names
 from neilfpp_method.prepare.progress import Bar, Bars

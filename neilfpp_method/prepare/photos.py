@@ -11,11 +11,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from neilfpp_method.data.brackets.photo_exposure import exif_entries, photo_exposure
+from neilfpp_method.data.files.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_header, read_image
+from neilfpp_method.data.files.paths import plain_name
+from neilfpp_method.data.files.raw import RAW_SUFFIXES, check_not_raw, develop
 from neilfpp_method.data.formats.places import view_names
-from neilfpp_method.data.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES, image_header, read_image
-from neilfpp_method.data.paths import plain_name
-from neilfpp_method.data.photo_exposure import exif_entries, photo_exposure
-from neilfpp_method.data.raw import RAW_SUFFIXES, check_not_raw, develop
 from neilfpp_method.errors import UserError
 
 __all__ = [

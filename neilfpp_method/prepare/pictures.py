@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image, ImageDraw
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.drawing.ink import INK, PALE_INK, PAPER, write

@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
 
-from neilfpp_method.data.camera import Camera, scaled_camera
-from neilfpp_method.data.images import read_image
-from neilfpp_method.data.undistort import resample, straight_camera
+from neilfpp_method.data.cameras.camera import Camera, scaled_camera
+from neilfpp_method.data.cameras.undistort import resample, straight_camera
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.shading.color import luminance
 

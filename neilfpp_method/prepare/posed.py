@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from neilfpp_method.data.cameras.colmap_library import pycolmap
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.raw import RAW_SUFFIXES
 from neilfpp_method.data.formats.colmap import camera_of
 from neilfpp_method.data.formats.copies import copy_view
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.raw import RAW_SUFFIXES
 from neilfpp_method.data.views import Normalization, SceneSource, View
 from neilfpp_method.prepare.matching_copies import relative_exposures
 from neilfpp_method.prepare.photos import Photos, read_photo

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import cKDTree
 
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.cameras.colmap_library import pycolmap
 from neilfpp_method.data.point_cloud import WorldPoints
 
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]

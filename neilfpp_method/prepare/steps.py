@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.files.atomic_file import replacing
 
 __all__ = ["Step", "begin", "stamp"]
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.cameras.colmap_library import pycolmap
 from neilfpp_method.data.capture import BOX_SOURCES
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.files.atomic_file import replacing
 from neilfpp_method.data.views import SceneSource
 
 __all__ = ["Placement", "Summary", "describe_cameras", "placements", "remarks_on", "write_summary"]

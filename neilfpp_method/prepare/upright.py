@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float64
 
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.cameras.colmap_library import pycolmap
 
 __all__ = ["turn_upright", "upright_rotation"]
 

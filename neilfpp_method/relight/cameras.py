@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera, scaled_camera
+from neilfpp_method.data.cameras.camera import Camera, scaled_camera
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

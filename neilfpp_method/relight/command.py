@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.size import at_size
 from neilfpp_method.fields.environment import EnvironmentLight

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header, read_image
+from neilfpp_method.data.files.images import IMAGE_SUFFIXES, image_header, read_image
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

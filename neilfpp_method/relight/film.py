@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.relight.cameras import pixel_rays
 from neilfpp_method.relight.path_tracer import DIMENSIONS, Scene, trace_paths
 from neilfpp_method.relight.sequence import Numbers, SobolSequence

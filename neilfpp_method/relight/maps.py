@@ -10,9 +10,9 @@ from typing import Literal
 
 import torch
 
-from neilfpp_method.data.environment_map import check_radiance
-from neilfpp_method.data.images import image_header, read_image
-from neilfpp_method.data.paths import plain_name
+from neilfpp_method.data.files.environment_map import check_radiance
+from neilfpp_method.data.files.images import image_header, read_image
+from neilfpp_method.data.files.paths import plain_name
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.shading.color import srgb_to_linear

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 
 __all__ = ["write_movie"]

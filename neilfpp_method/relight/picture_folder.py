@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.cameras import Shot
 from neilfpp_method.relight.film import Picture

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import pixel_index, project
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import image_header, read_image
-from neilfpp_method.data.projection import pixel_index, project
+from neilfpp_method.data.files.images import image_header, read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.cameras import MAX_SIDE, resized
 from neilfpp_method.relight.edits import Limit

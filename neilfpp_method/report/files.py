@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.health.cases import Finding

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.files.atomic_file import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.report import pictures, tables
 from neilfpp_method.report.data_urls import image_url

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neilfpp_method.budget.durations import format_duration
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.tradeoff.figure import draw_frontier
 from neilfpp_method.tradeoff.frontier import FIGURES, RunResult, frontier
 from neilfpp_method.train.provenance import provenance

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neilfpp_method.budget.plan import Costs, StageCost
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.plain import from_dict

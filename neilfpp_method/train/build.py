@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neilfpp_method.data.backdrop import border_color, border_median
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.environment_map import read_environment
+from neilfpp_method.data.files.environment_map import read_environment
 from neilfpp_method.data.mesh import read_mesh
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.backdrop import border_color, border_median
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
-from neilfpp_method.data.projection import camera_rays
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.effects.exposure import Exposures, measure_exposures
 from neilfpp_method.errors import UserError

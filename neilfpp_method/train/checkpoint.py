@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.files.atomic_file import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.tensor_file import read_tensor_file
 

@@ -14,9 +14,9 @@ from rich.console import Console
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.held_back import PATCHES, hold_back
-from neilfpp_method.data.object_source import object_line, object_sources, stored_masks
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.data.pixels.held_back import PATCHES, hold_back
+from neilfpp_method.data.pixels.object_source import object_line, object_sources, stored_masks
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import record_exposures, record_facts
 from neilfpp_method.effects.table import effects_table

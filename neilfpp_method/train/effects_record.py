@@ -15,7 +15,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.effects.catalogue import EFFECTS
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.plan import Decision, Plan

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.material_search import is_comparison_due
 from neilfpp_method.effects.places import Places

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.health.cases import Finding
 from neilfpp_method.health.watch import FILE, FORMAT, Watch
 from neilfpp_method.train.json_files import read_entries

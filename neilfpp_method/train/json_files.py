@@ -1,4 +1,4 @@
-"""Read the JSON objects of a run folder; `data.json_entry.write_json` writes them."""
+"""Read the JSON objects of a run folder; `data.files.json_entry.write_json` writes them."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.lighting.decision import MIN_SAMPLES
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.settings.types import FreeLightConfig, MapLightConfig

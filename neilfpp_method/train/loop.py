@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from torch import Tensor
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import Diverged, Stopped, UserError
 from neilfpp_method.health.guard import MAX_SKIPPED_IN_A_ROW
 from neilfpp_method.hosts.base import HasSurfaceWidth

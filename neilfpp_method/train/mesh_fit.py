@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.hosts.mesh import MeshHost
 
 __all__ = ["MeshFit", "measure_mesh_fit"]

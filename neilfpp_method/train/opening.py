@@ -14,7 +14,7 @@ from rich.console import Console
 
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.environment_map import check_environment
+from neilfpp_method.data.files.environment_map import check_environment
 from neilfpp_method.data.scaling import at_scale, scale_for_rays
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest, check_effects

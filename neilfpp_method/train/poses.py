@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.fields.poses import PoseCorrections, PoseMotion, rotation_matrices
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import PixelBatch

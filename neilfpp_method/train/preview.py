@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import write_png
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.files.images import write_png
+from neilfpp_method.data.pixels.view_pixels import read_colors
 from neilfpp_method.data.scaling import file_size, scaled_view
-from neilfpp_method.data.view_pixels import read_colors
 from neilfpp_method.data.views import View
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.schedule import Stage

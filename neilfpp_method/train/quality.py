@@ -1,4 +1,4 @@
-"""Measure the quality of a training while it runs, at held-back pixels (`data.held_back`).
+"""Measure the quality of a training while it runs, at held-back pixels (`data.pixels.held_back`).
 
 The pixels are rendered as evaluation renders test views, and the PSNR is computed like `volume_psnr` and
 `pbr_psnr`, from clipped values encoded as sRGB. A check is made after every tenth of a stage, but at least
@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePosition

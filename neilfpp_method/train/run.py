@@ -31,7 +31,7 @@ from typing import Any, Literal, TypeVar
 import torch
 
 from neilfpp_method.data.capture import Capture, Normalization, load_capture
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel

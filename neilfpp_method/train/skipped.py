@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neilfpp_method.data.atomic_file import replacing
+from neilfpp_method.data.files.atomic_file import replacing
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition

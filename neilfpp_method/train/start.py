@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.cloud_hull import find_cloud_hull
-from neilfpp_method.data.silhouettes import Outline, read_outlines
-from neilfpp_method.data.visual_hull import DistanceCube, find_hull
+from neilfpp_method.data.hulls.cloud_hull import find_cloud_hull
+from neilfpp_method.data.hulls.silhouettes import Outline, read_outlines
+from neilfpp_method.data.hulls.visual_hull import DistanceCube, find_hull
 from neilfpp_method.fields.sdf import SdfField
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel

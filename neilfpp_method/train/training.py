@@ -9,7 +9,7 @@ from pathlib import Path
 from lightning_fabric import Fabric
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting.solver import LightSolver

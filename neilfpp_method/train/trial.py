@@ -16,7 +16,7 @@ import torch
 
 from neilfpp_method.budget.plan import Costs, StageCost
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.data.views import View
 from neilfpp_method.effects.first_light import seconds_of_pixel

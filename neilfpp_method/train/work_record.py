@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.timing.ledger import WORK, Ledger
 from neilfpp_method.train.json_files import is_finite_number, read_json

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.evaluate.pictures import display, display_color, display_error
 from neilfpp_method.relight.cameras import pixel_rays, resized
 from neilfpp_method.relight.path_tracer import DIMENSIONS, trace_paths

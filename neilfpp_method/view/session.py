@@ -17,8 +17,8 @@ import torch
 import viser
 from jaxtyping import Float, UInt8
 
+from neilfpp_method.data.pixels.view_pixels import read_colors
 from neilfpp_method.data.scaling import file_size, scaled_view
-from neilfpp_method.data.view_pixels import read_colors
 from neilfpp_method.data.views import View
 from neilfpp_method.evaluate.pictures import display_color
 from neilfpp_method.relight.cameras import turntable

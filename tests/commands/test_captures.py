@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from tests.calls import refused
 
 

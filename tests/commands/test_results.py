@@ -14,7 +14,7 @@ import trimesh
 from neilfpp_method.cli import main
 from neilfpp_method.commands.evaluate import Eval
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate import scene_metrics
 from neilfpp_method.evaluate.published import PROTOCOLS

@@ -14,7 +14,7 @@ from neilfpp_method.cli import main
 from neilfpp_method.compare.runs import labels_of
 from neilfpp_method.compare.sheet import shortened
 from neilfpp_method.compare.write import compare_runs
-from neilfpp_method.data.images import image_header, read_image
+from neilfpp_method.data.files.images import image_header, read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.checkpoint import last_checkpoint
 from tests.calls import train_tiny

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from tests.data.make_capture import camera_pose
 
 

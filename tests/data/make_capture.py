@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 
 CENTER = np.array([0.3, -0.2, 0.5])
 RADIUS = 1.2

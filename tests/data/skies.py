@@ -9,8 +9,8 @@ from pathlib import Path
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_exr
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.files.images import write_exr
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from tests.data.make_capture import make_capture
 
 GROUND, SKY = 0.25, (0.3, 0.5, 0.9)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import camera_rays, project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.projection import camera_rays, project
 from tests.data.make_capture import CENTER, RADIUS, SCALE, camera_pose, make_capture
 
 DATA = Path(os.environ.get("NEILFPP_DATA", Path(__file__).parents[2].parent / "shared" / "data"))

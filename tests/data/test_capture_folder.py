@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from neilfpp_method.data.cameras.lens import Lens
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.capture_folder import write_capture
-from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.data.lens import Lens
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.data.views import CaptureFiles, Normalization
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTER, SCALE, camera_pose, make_capture

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.data.focus import find_focus
-from neilfpp_method.data.images import write_png
 from neilfpp_method.data.scene_box import REACH, box_of_focus, box_of_points, find_box
 from neilfpp_method.data.views import View
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.lens import Lens
+from neilfpp_method.data.cameras.projection import CameraRays, project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.projection import CameraRays, project
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.scaling import (
     PIXELS_OF_A_RAY,
     PIXELS_OF_A_VIEW,

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_png
-from neilfpp_method.data.projection import project
+from neilfpp_method.data.files.images import read_image, write_png
 from neilfpp_method.data.scene_box import box_of_cameras, box_of_points, find_box
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import METALLIC, RADIUS, ROUGHNESS, SCALE, base_color, make_capture

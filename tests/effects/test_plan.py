@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.material import JUDGED
 from neilfpp_method.effects.measurement import Measurement, mean_of

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField, Truth
 from neilfpp_method.errors import UserError

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.export import light as light_module
 from neilfpp_method.export.light import export_light

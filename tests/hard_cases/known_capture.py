@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from tests.data.make_capture import srgb
 from tests.hard_cases.known_ball import RADIUS, KnownBall
 from tests.hard_cases.known_shapes import Distance, meet

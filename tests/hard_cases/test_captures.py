@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neilfpp_method.data.backdrop import border_color
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.files.images import write_exr, write_png
+from neilfpp_method.data.pixels.backdrop import border_color
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.errors import UserError
 from tests.data.formats.scenes import refused
 from tests.data.make_capture import make_capture

@@ -22,7 +22,7 @@ import trimesh
 from torch.nn.functional import normalize
 
 from neilfpp_method.attach import AttachedNeilf, attach_neilf, pixel_batch
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.hosts.mesh import MeshHost

@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.projection import camera_rays, project
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import camera_rays, project
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.fields.encodings import direction_encoding, position_encoding
 from neilfpp_method.fields.environment import EnvironmentLight

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.train.loop import train
 from tests.data.make_capture import CENTER, RADIUS, SCALE, make_capture, srgb

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.files.images import read_image, write_exr
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.point_cloud import read_oriented_ply, write_oriented_ply
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.loop import train

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.measure import measure_surface
 from neilfpp_method.health.watch import Watch

@@ -18,7 +18,7 @@ from PIL import Image
 import neilfpp_method
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.inspection.defects import Inspection, inspect_capture, problems_of_poses
 from tests.data.make_capture import make_capture, srgb, write_ply
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.data.views import View
 from neilfpp_method.inspection.measure import ViewFigures, measure
 from tests.data.make_capture import make_capture

@@ -13,9 +13,9 @@ import pytest
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.raw import Developed
 from neilfpp_method.data.point_cloud import read_oriented_ply
-from neilfpp_method.data.raw import Developed
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.prepare import command
 from neilfpp_method.prepare import photos as photo_files

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps
 from neilfpp_method.prepare.depth_planes import fit_planes

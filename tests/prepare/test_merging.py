@@ -12,9 +12,9 @@ from PIL import Image
 from rich.console import Console
 
 from neilfpp_method.cli import main
-from neilfpp_method.data import bracket_folder
+from neilfpp_method.data.brackets import folder as bracket_folder
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.merging import brackets_among, merge_photos
 from neilfpp_method.prepare.photos import Photos, survey

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.matching_copies import relative_exposures, write_copies
 from neilfpp_method.prepare.photos import read_photo, survey

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.errors import UserError

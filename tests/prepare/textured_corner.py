@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 
 TARGET = np.array([0.3, 0.3, 0.25])
 DISTANCE = 1.5

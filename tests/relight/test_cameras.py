@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.data.camera import check_camera
+from neilfpp_method.data.cameras.camera import check_camera
+from neilfpp_method.data.cameras.lens import Lens
+from neilfpp_method.data.cameras.projection import camera_rays, project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.projection import camera_rays, project
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.cameras import rays_through, resized, turntable, view_shots
 from tests.data.make_capture import make_capture

@@ -14,7 +14,7 @@ import torch
 
 from neilfpp_method.cli import COMMANDS, main
 from neilfpp_method.commands.command import Command
-from neilfpp_method.data.images import read_image, write_exr, write_png
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.export import surface_cache
 from neilfpp_method.relight import command
 from neilfpp_method.relight.lamplight import Lamplight

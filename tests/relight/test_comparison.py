@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.comparison import TrueImage, compare, find_truth, read_truth
 from tests.data.make_capture import make_capture, srgb

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.relight import film
 from neilfpp_method.relight.film import Budget, render_picture
 from neilfpp_method.relight.path_tracer import Scene

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.maps import check_map, map_names, read_map
 

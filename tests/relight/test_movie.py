@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight import movie
 

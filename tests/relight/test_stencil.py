@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.images import write_png
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight import stencil
 from neilfpp_method.relight.stencil import masked_limit, read_stencils

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.relight.request import RelightRequest
 from neilfpp_method.settings import presets

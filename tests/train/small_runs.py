@@ -14,8 +14,8 @@ from lightning_fabric import Fabric
 from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.held_back import PATCHES, hold_back
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.data.pixels.held_back import PATCHES, hold_back
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.health.watch import Watch

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import PRESETS

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.data.mesh import Mesh, read_mesh
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.train.build import scene_facts
 from neilfpp_method.train.mesh_fit import MeshFit, measure_mesh_fit

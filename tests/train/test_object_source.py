@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.train import command
 from neilfpp_method.train.request import TrainingRequest
 from tests.data.make_capture import make_capture

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import fixed_geometry, preset

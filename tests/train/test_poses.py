@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.images import write_exr, write_png
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.effects import review
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.request import parse_effects

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.model import CLEAR_OPACITY
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset

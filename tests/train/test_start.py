@@ -13,10 +13,10 @@ import torch
 from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.cloud_hull import find_cloud_hull
-from neilfpp_method.data.images import write_png
-from neilfpp_method.data.pixels import PixelDataset
-from neilfpp_method.data.visual_hull import find_hull
+from neilfpp_method.data.files.images import write_png
+from neilfpp_method.data.hulls.cloud_hull import find_cloud_hull
+from neilfpp_method.data.hulls.visual_hull import find_hull
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition

@@ -7,7 +7,7 @@ import time
 import pytest
 from rich.console import Console
 
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import Stopped, UserError
 from neilfpp_method.timing.ledger import WORK
 from neilfpp_method.train.command import run_training

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neilfpp_method.data.projection import project
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.view.cameras import MAX_SIDE, Pose, pinhole, pose_of
 
 # Looks along world +x; its right is −y: x_cam = −y, y_cam = −z, z_cam = x.

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.images import write_exr
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.view import command
 from neilfpp_method.view.address import check_address

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from neilfpp_method.data import memory
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.evaluate.pictures import lat_long_directions
 from neilfpp_method.relight.cameras import turntable
 from neilfpp_method.relight.film import Budget, render_picture

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from neilfpp_method.data.files.json_entry import Entry
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.formats.places import stored, view_names
 from neilfpp_method.data.formats.transforms import Frame, Frames, read_frames
-from neilfpp_method.data.json_entry import Entry
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import CaptureFiles, View
 

@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.colmap_library import pycolmap
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.colmap_library import pycolmap
+from neilfpp_method.data.cameras.lens import PANORAMAS, lens_of
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.formats.colmap_sizes import check_sizes
 from neilfpp_method.data.formats.places import check_masks, stored, stored_images, view_names
-from neilfpp_method.data.lens import PANORAMAS, lens_of
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.point_cloud import read_positions
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import CaptureFiles, View

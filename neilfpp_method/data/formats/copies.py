@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from neilfpp_method.data.atomic_file import replacing
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.undistort import resample, straight_camera
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.undistort import resample, straight_camera
+from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.shading.color import linear_to_srgb, srgb_to_linear

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.linalg import rq
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.images import IMAGE_SUFFIXES, image_header
-from neilfpp_method.data.number_arrays import arrays_of_archive
-from neilfpp_method.data.paths import inside
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import IMAGE_SUFFIXES, image_header
+from neilfpp_method.data.files.number_arrays import arrays_of_archive
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.views import CaptureFiles, Normalization, View
 from neilfpp_method.errors import UserError
 

@@ -14,12 +14,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import image_header
+from neilfpp_method.data.files.json_entry import Entry
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.formats.places import stored
 from neilfpp_method.data.formats.transforms import focal_of_angle, pose_from_opengl
-from neilfpp_method.data.images import image_header
-from neilfpp_method.data.json_entry import Entry
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.scene_box import find_box
 from neilfpp_method.data.views import CaptureFiles, View
 from neilfpp_method.errors import UserError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.lens import Lens, lens_of
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.lens import Lens, lens_of
 from neilfpp_method.errors import UserError
 
 __all__ = ["COEFFICIENTS", "FISHEYE", "lens_from_nerfstudio", "nerfstudio_coefficients"]

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import image_header
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
 from neilfpp_method.data.formats.places import stored_image
-from neilfpp_method.data.images import image_header
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.views import CaptureFiles, Normalization, View
 from neilfpp_method.errors import UserError
 

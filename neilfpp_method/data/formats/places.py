@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
-from neilfpp_method.data.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES
-from neilfpp_method.data.paths import inside
+from neilfpp_method.data.files.images import IMAGE_SUFFIXES, UNREAD_SUFFIXES
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 

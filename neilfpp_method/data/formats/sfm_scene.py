@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.files.images import IMAGE_SUFFIXES
+from neilfpp_method.data.files.json_entry import Entry
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.formats.places import check_masks, stored, stored_image
-from neilfpp_method.data.images import IMAGE_SUFFIXES
-from neilfpp_method.data.json_entry import Entry
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.point_cloud import read_oriented_ply
 from neilfpp_method.data.views import CaptureFiles, Normalization, View
 from neilfpp_method.errors import UserError

@@ -27,13 +27,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.capture_folder import read_scene
+from neilfpp_method.data.files.images import image_header
+from neilfpp_method.data.files.json_entry import Entry
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.formats.nerfstudio_lens import COEFFICIENTS, FISHEYE, lens_from_nerfstudio
 from neilfpp_method.data.formats.places import stored, stored_image, stored_images, view_names
-from neilfpp_method.data.images import image_header
-from neilfpp_method.data.json_entry import Entry
-from neilfpp_method.data.paths import inside
 from neilfpp_method.data.point_cloud import has_normals, read_positions
 from neilfpp_method.data.scene_box import SceneBox, find_box
 from neilfpp_method.data.views import CaptureFiles, View

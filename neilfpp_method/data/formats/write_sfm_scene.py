@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.data.formats.copies import copy_file, copy_view, writing
-from neilfpp_method.data.json_entry import write_json
 
 __all__ = ["write_sfm_scene"]
 

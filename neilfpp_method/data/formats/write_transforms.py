@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.data.formats.copies import copy_file, copy_view, writing
 from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, nerfstudio_coefficients
 from neilfpp_method.data.formats.transforms import FLIP
-from neilfpp_method.data.json_entry import write_json
 from neilfpp_method.data.views import View
 
 __all__ = ["write_transforms"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.json_entry import write_json
+from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.size import measured_views

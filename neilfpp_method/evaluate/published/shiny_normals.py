@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import read_image
-from neilfpp_method.data.paths import inside
+from neilfpp_method.data.files.images import read_image
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import View

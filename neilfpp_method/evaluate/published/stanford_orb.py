@@ -35,9 +35,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import Capture
-from neilfpp_method.data.images import read_image
-from neilfpp_method.data.projection import camera_rays
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

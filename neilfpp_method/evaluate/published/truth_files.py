@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from neilfpp_method.data.images import ImageFile, read_image
-from neilfpp_method.data.number_arrays import array_of
-from neilfpp_method.data.paths import inside
+from neilfpp_method.data.files.images import ImageFile, read_image
+from neilfpp_method.data.files.number_arrays import array_of
+from neilfpp_method.data.files.paths import inside
 from neilfpp_method.data.scaling import file_size
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError

@@ -8,7 +8,7 @@ import numpy as np
 import xatlas
 from jaxtyping import Float, Int
 
-from neilfpp_method.data.ply import needs_double
+from neilfpp_method.data.files.ply import needs_double
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.surface import AssetSurface
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from neilfpp_method.data.images import write_exr, write_png
-from neilfpp_method.data.json_entry import write_json
-from neilfpp_method.data.ply import NORMAL, write_ply
+from neilfpp_method.data.files.images import write_exr, write_png
+from neilfpp_method.data.files.json_entry import write_json
+from neilfpp_method.data.files.ply import NORMAL, write_ply
 from neilfpp_method.export.asset.atlas import Unwrapped
 from neilfpp_method.export.asset.bake import Textures
 from neilfpp_method.export.asset.environment import equirectangular

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from neilfpp_method.data.camera import Camera
-from neilfpp_method.data.projection import CameraRays, pixel_index, project
+from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.projection import CameraRays, pixel_index, project
 from neilfpp_method.export.asset.surface import AssetSurface, first_hits
 
 __all__ = ["visible_faces"]

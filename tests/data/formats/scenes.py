@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTER, RADIUS, camera_pose, make_capture
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_png
-from neilfpp_method.data.projection import project
+from neilfpp_method.data.files.images import read_image, write_png
 from tests.data.formats.scenes import POINTS, VIEWS, WIDTH, local, material, opengl_pose, refused
 from tests.data.make_capture import CENTER, RADIUS
 

@@ -12,11 +12,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from neilfpp_method.data.cameras.lens import LENSES, PINHOLES
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_png
-from neilfpp_method.data.lens import LENSES, PINHOLES
-from neilfpp_method.data.projection import project
+from neilfpp_method.data.files.images import read_image, write_png
 from neilfpp_method.errors import UserError
+from tests.data.cameras.test_lens import COEFFICIENTS
 from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,
@@ -31,7 +32,6 @@ from tests.data.formats.scenes import (
     refused,
 )
 from tests.data.make_capture import CENTER, RADIUS
-from tests.data.test_lens import COEFFICIENTS
 
 MODELS = (*sorted(PINHOLES), *LENSES)
 

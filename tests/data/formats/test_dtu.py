@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.projection import project
 from tests.data.formats.scenes import (
     FOCAL,
     POINTS,

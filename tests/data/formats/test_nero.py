@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
-from neilfpp_method.data.projection import project
 from neilfpp_method.errors import UserError
 from tests.data.formats.scenes import (
     FOCAL,

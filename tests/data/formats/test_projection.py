@@ -15,9 +15,10 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from neilfpp_method.data.cameras.lens import LENSES
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import READERS, load_capture
-from neilfpp_method.data.lens import LENSES
-from neilfpp_method.data.projection import project
+from tests.data.cameras.test_lens import COEFFICIENTS
 from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,
@@ -31,7 +32,6 @@ from tests.data.formats.scenes import (
     pinhole_pixels,
 )
 from tests.data.make_capture import CENTER, SCALE
-from tests.data.test_lens import COEFFICIENTS
 
 TOLERANCE = 0.01
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

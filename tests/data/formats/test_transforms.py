@@ -12,8 +12,8 @@ import pytest
 import torch
 import trimesh
 
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.projection import project
 from tests.data.formats.scenes import (
     FOCAL,
     HEIGHT,

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import torch
 
+from neilfpp_method.data.cameras.lens import Lens
+from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import Capture, load_capture
+from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.data.formats.write_sfm_scene import write_sfm_scene
 from neilfpp_method.data.formats.write_transforms import write_transforms
-from neilfpp_method.data.images import read_image, write_exr, write_png
-from neilfpp_method.data.lens import Lens
-from neilfpp_method.data.projection import project
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
+from tests.data.cameras.test_lens import COEFFICIENTS
 from tests.data.formats.scenes import POINTS, pinhole_pixels
 from tests.data.make_capture import make_capture
-from tests.data.test_lens import COEFFICIENTS
 
 WRITERS: dict[str, Callable[[Capture, Path], Path]] = {
     "transforms": write_transforms,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.capture import load_capture
-from neilfpp_method.data.images import read_image, write_png
+from neilfpp_method.data.files.images import read_image, write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
 from neilfpp_method.evaluate.published.neilf_synthetic import aces, median_gamma

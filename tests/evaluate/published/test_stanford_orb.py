@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neilfpp_method.data.images import write_exr, write_png
+from neilfpp_method.data.files.images import write_exr, write_png
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS, stanford_orb

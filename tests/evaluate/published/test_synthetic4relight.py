@@ -9,7 +9,7 @@ from statistics import median_low
 import numpy as np
 import pytest
 
-from neilfpp_method.data.images import write_png
+from neilfpp_method.data.files.images import write_png
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published import PROTOCOLS
 from tests.data.make_capture import make_capture

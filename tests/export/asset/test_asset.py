@@ -17,7 +17,7 @@ import torch
 import trimesh
 from scipy.ndimage import map_coordinates
 
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset import files as files_module
 from neilfpp_method.export.asset import texels

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from neilfpp_method.cli import main
-from neilfpp_method.data.images import read_image
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.train.run import load_run
 from tests.calls import refused, train_tiny
 from tests.data.make_capture import CENTER, RADIUS, SCALE, srgb

@@ -14,8 +14,8 @@ import pytest
 import torch
 from scipy.ndimage import binary_erosion
 
-from neilfpp_method.data.images import read_image
-from neilfpp_method.data.projection import camera_rays, project
+from neilfpp_method.data.cameras.projection import camera_rays, project
+from neilfpp_method.data.files.images import read_image
 from neilfpp_method.export.asset.environment import equirectangular
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.structures import RayBatch

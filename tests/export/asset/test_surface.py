@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from neilfpp_method.data.camera import Camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_visible, remove_small_components
 from neilfpp_method.export.asset.simplify import distance_between, simplified

@@ -26,7 +26,7 @@ import torch
 import trimesh
 
 from neilfpp_method.cli import main as neilfpp
-from neilfpp_method.data.images import read_image, write_exr
+from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.layout import WORK
 from neilfpp_method.settings.presets import PRESETS

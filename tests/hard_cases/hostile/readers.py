@@ -19,14 +19,14 @@ import trimesh
 import yaml
 from PIL import Image
 
-from neilfpp_method.data.bracket_folder import find_brackets
+from neilfpp_method.data.brackets.folder import find_brackets
+from neilfpp_method.data.brackets.photo_exposure import photo_exposure, read_exposures
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.environment_map import read_environment
+from neilfpp_method.data.files.environment_map import read_environment
+from neilfpp_method.data.files.images import image_header, read_image, write_exr, write_png
 from neilfpp_method.data.formats.pickled_arrays import read_pickled_arrays
-from neilfpp_method.data.images import image_header, read_image, write_exr, write_png
 from neilfpp_method.data.mesh import read_mesh
-from neilfpp_method.data.photo_exposure import photo_exposure, read_exposures
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.point_cloud import has_normals, read_oriented_ply, read_positions
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.data.views import Normalization

@@ -11,7 +11,7 @@ import trimesh
 from scipy.io import savemat
 
 from neilfpp_method.data.capture import Capture, load_capture
-from neilfpp_method.data.pixels import PixelDataset
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.evaluate.published.dtu import read_scan
 from neilfpp_method.evaluate.published.truth_files import read_array

@@ -1,0 +1,1 @@
+"""Exposure brackets: find, align and merge photographs of several exposures."""

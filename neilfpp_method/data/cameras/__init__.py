@@ -1,0 +1,1 @@
+"""Cameras: intrinsics, lens distortion, projection, and the import of COLMAP."""

@@ -1,0 +1,1 @@
+"""Shapes that silhouettes or points bound: where the geometry starts."""

@@ -1,0 +1,108 @@
+"""Compute the shape that a point cloud hides from the cameras, and its signed distance.
+
+A point that a camera sees has empty space in front of it, and hides what is behind it. This is the fusion of
+depth maps by a vote instead of a mean (Curless and Levoy 1996), because the depth maps of a point cloud have
+gaps and false points. Space that no point hides, such as the sky above a roof, is empty. Like a visual hull,
+the shape contains the object and fills what no camera sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from scipy import ndimage
+from torch import Tensor
+
+from neilfpp_method.data.cameras.camera import Camera, scaled_camera
+from neilfpp_method.data.cameras.projection import pixel_index, project
+from neilfpp_method.data.hulls.visual_hull import (
+    MIN_CELLS,
+    MIN_SEEN_SHARE,
+    RESOLUTION,
+    DistanceCube,
+    cell_centers,
+    signed_distance,
+)
+from neilfpp_method.structures import OrientedPoints
+
+__all__ = ["find_cloud_hull"]
+
+DEPTH_SIDE = 96
+"""Longer side of a depth map in pixels; a pixel then shows about as much as a cell of the cube is wide."""
+GAP = 2
+"""Distance in pixels over which a point also covers its neighbours. Without it, cameras look through the gaps
+between the points of an object and find the table behind it: the objects of `tabletop_env` disappear.
+"""
+TOLERANCE = 1.5
+"""Smallest distance in front of a point at which space is empty, in cells."""
+MARGIN = 2
+"""Cells by which the shape extends beyond the ball, so that the cut is outside."""
+MIN_HIDDEN_SHARE = 0.5
+"""Smallest share of the views with a cell in the image from which points must hide it."""
+MAX_EMPTY_SHARE = 0.2
+"""Largest share of these views that may see a cell as empty. False points and gaps cause some."""
+
+
+def find_cloud_hull(
+    points: OrientedPoints, cameras: Sequence[Camera], radius: float, resolution: int = RESOLUTION
+) -> DistanceCube | str:
+    """Compute the signed distance of the shape that points hide.
+
+    Args:
+        points: surface points with outward normals, scene frame.
+        cameras: the cameras that saw them, scene frame.
+        radius: radius of the ball in which the shape is needed, and half an edge of the cube of the result,
+            scene units. Shapes that extend beyond the ball are cut off `MARGIN` cells outside of it.
+        resolution: number of cells along an edge.
+
+    Returns:
+        The distance; or, if the points hide almost nothing, the reason in a few words.
+
+    Example:
+        >>> hull = find_cloud_hull(points, cameras, radius=1.75)
+        >>> hull if isinstance(hull, str) else hull.at(points.position)  # about 0
+    """
+    cell = 2 * radius / resolution
+    centers = torch.from_numpy(cell_centers(radius, resolution))
+    points = points.to("cpu")
+    # A corner of the cube is seen by few views, all of them from behind the object.
+    in_ball = centers.norm(dim=-1) < radius + MARGIN * cell
+    views, hidden, empty = torch.zeros(3, len(centers))
+    for camera in cameras:
+        camera = _reduced(camera)
+        projected = project(camera, centers)
+        index = pixel_index(projected, camera)
+        in_image = index >= 0
+        first = torch.where(in_image, _depth_map(camera, points).flatten()[index], torch.inf)
+        in_front = projected.depth < first - TOLERANCE * cell
+        known = first.isfinite()
+        views += in_image
+        empty += known & in_front
+        hidden += known & ~in_front
+    enough_views = views >= max(2, MIN_SEEN_SHARE * len(cameras))
+    hides = (hidden >= MIN_HIDDEN_SHARE * views) & (empty <= MAX_EMPTY_SHARE * views)
+    solid = in_ball & enough_views & hides
+    if solid.sum() < MIN_CELLS:
+        return "the point cloud hides almost nothing from the cameras"
+    cube = solid.numpy().reshape(resolution, resolution, resolution)
+    return DistanceCube(torch.from_numpy(signed_distance(cube, cell)), radius)
+
+
+def _reduced(camera: Camera) -> Camera:
+    """The camera with the size of a depth map."""
+    factor = DEPTH_SIDE / max(camera.width, camera.height)
+    width, height = (max(1, round(factor * side)) for side in (camera.width, camera.height))
+    return scaled_camera(camera, width, height)
+
+
+def _depth_map(camera: Camera, points: OrientedPoints) -> Float[Tensor, "H W"]:
+    """Depth of the first point that faces the camera in or near each pixel; infinite where there is none."""
+    to_camera = torch.from_numpy(camera.c2w[:, 3]).to(points.position) - points.position
+    projected = project(camera, points.position[(to_camera * points.normal).sum(-1) > 0])
+    index = pixel_index(projected, camera)
+    first = projected.depth.new_full((camera.height * camera.width,), torch.inf)
+    first.scatter_reduce_(0, index[index >= 0], projected.depth[index >= 0], "amin")
+    covered = ndimage.minimum_filter(first.view(camera.height, camera.width).numpy(), 2 * GAP + 1)
+    return torch.from_numpy(covered)
