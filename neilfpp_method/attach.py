@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.files.environment_map import read_environment
-from neilfpp_method.effects.place_solver import PlaceSolver
+from neilfpp_method.effects.places.solver import PlaceSolver
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard

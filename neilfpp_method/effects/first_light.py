@@ -18,10 +18,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.effects.lamps import LampTrial
+from neilfpp_method.effects.evidence.lamps import LampTrial
 from neilfpp_method.effects.light_scale import FIRST_SCALE, SCALES, lowest_scale, scale_of_metals
-from neilfpp_method.effects.place_data import PlaceData
-from neilfpp_method.effects.place_fit import (
+from neilfpp_method.effects.places.data import PlaceData
+from neilfpp_method.effects.places.fit import (
     FIRST_STEPS,
     ROUNDS,
     STEPS,

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.measurement import mean_of
-from neilfpp_method.effects.place_data import PlaceData
-from neilfpp_method.effects.place_fit import Permitted, PlaceFit, fit_places
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.data import PlaceData
+from neilfpp_method.effects.places.fit import Permitted, PlaceFit, fit_places
+from neilfpp_method.effects.places.gathering import Places
 
 __all__ = ["FIRST_SCALE", "SCALES", "lowest_scale", "scale_of_metals", "unbounded_scale"]
 

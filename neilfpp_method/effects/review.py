@@ -11,20 +11,20 @@ from dataclasses import dataclass
 import torch
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
-from neilfpp_method.effects.exposure import Exposures
+from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shading_disagreement
+from neilfpp_method.effects.evidence.exposure import Exposures
+from neilfpp_method.effects.evidence.lobes import lobe_evidence
+from neilfpp_method.effects.evidence.material import JUDGED, material_evidence
+from neilfpp_method.effects.evidence.metals import find_metal, metals_evidence, metals_evidence_in
+from neilfpp_method.effects.evidence.poses import pose_evidence
+from neilfpp_method.effects.evidence.visibility import self_visibility
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light
-from neilfpp_method.effects.lit_places import light_up
-from neilfpp_method.effects.lobes import lobe_evidence
-from neilfpp_method.effects.material import JUDGED, material_evidence
-from neilfpp_method.effects.material_search import search_materials, teach
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.metals import find_metal, metals_evidence, metals_evidence_in
-from neilfpp_method.effects.place_data import PlaceData, place_transport
-from neilfpp_method.effects.places import Places, gather_places
+from neilfpp_method.effects.places.data import PlaceData, place_transport
+from neilfpp_method.effects.places.gathering import Places, gather_places
+from neilfpp_method.effects.places.lit import light_up
+from neilfpp_method.effects.places.search import search_materials, teach
 from neilfpp_method.effects.plan import Decision, Plan
-from neilfpp_method.effects.poses import pose_evidence
-from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import has_material
@@ -177,10 +177,10 @@ def light_places(model: NeilfModel, pixels: PixelDataset, max_pixels: int = MAX_
 
 
 def improve_material(model: NeilfModel, places: Places) -> str | None:
-    """Search for paint taken for metal, and train the BRDF field on it (`effects.material_search`).
+    """Search for paint taken for metal, and train the BRDF field on it (`effects.places.search`).
 
     Args:
-        model: its light is an environment map; see `material_search.is_search_due`.
+        model: its light is an environment map; see `places.search.is_search_due`.
         places: places in the training views, with linear radiance.
 
     Returns:
@@ -201,7 +201,7 @@ def review_metals(plan: Plan, model: NeilfModel, places: Places, step: int) -> l
 
     Args:
         plan: the plan to which the decision is added.
-        model: its light is an environment map; see `material_search.is_comparison_due`.
+        model: its light is an environment map; see `places.search.is_comparison_due`.
         places: places in the training views, with linear radiance.
         step: number of steps trained so far.
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.material_search import is_search_due
+from neilfpp_method.effects.places.search import is_search_due
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import improve_material, light_places, review_light

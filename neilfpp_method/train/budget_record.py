@@ -50,8 +50,8 @@ class BudgetPlan:
         budget: time of the whole command, in seconds.
         size: size of a step (`budget.sizes`).
         costs: costs that the trial measured.
-        places_looked_at: whether there is time to measure evidence at places (`effects.material`), which
-            decides open effects of material and light.
+        places_looked_at: whether there is time to measure evidence at places
+            (`effects.evidence.material`), which decides open effects of material and light.
         light_pixels: maximum number of pixels for the search of the initial light; 0 for no search; None for
             the number without a budget.
         revisions: all plans in order, beginning with that before training; the last one applies.

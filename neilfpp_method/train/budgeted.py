@@ -9,7 +9,7 @@ from pathlib import Path
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
-from neilfpp_method.effects.material import JUDGED
+from neilfpp_method.effects.evidence.material import JUDGED
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig

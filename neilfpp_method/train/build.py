@@ -18,7 +18,7 @@ from neilfpp_method.data.pixels.backdrop import border_color, border_median
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.data.truth import Truth
-from neilfpp_method.effects.exposure import Exposures, measure_exposures
+from neilfpp_method.effects.evidence.exposure import Exposures, measure_exposures
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields import PoseCorrections
 from neilfpp_method.hosts.base import Host

@@ -9,11 +9,11 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.evidence.poses import next_motion
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.material_search import is_comparison_due
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.search import is_comparison_due
 from neilfpp_method.effects.plan import Decision, Plan
-from neilfpp_method.effects.poses import next_motion
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
     MIN_PIXELS,

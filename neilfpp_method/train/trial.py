@@ -19,9 +19,9 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.data.views import View
+from neilfpp_method.effects.evidence.material import JUDGED, seconds_of_evidence
 from neilfpp_method.effects.first_light import seconds_of_pixel
-from neilfpp_method.effects.material import JUDGED, seconds_of_evidence
-from neilfpp_method.effects.material_search import SEARCH_AT, SEARCH_SHARE
+from neilfpp_method.effects.places.search import SEARCH_AT, SEARCH_SHARE
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.effects.place_data import ROWS, PlaceData, place_transport
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.data import ROWS, PlaceData, place_transport
+from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.shading.brdf import Lobe

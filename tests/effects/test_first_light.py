@@ -7,13 +7,13 @@ import math
 import pytest
 import torch
 
+from neilfpp_method.effects.evidence.lamps import LampTrial
+from neilfpp_method.effects.evidence.lobes import lobe_evidence
+from neilfpp_method.effects.evidence.metals import metals_evidence
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light, start_with
-from neilfpp_method.effects.lamps import LampTrial
-from neilfpp_method.effects.lobes import lobe_evidence
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.metals import metals_evidence
-from neilfpp_method.effects.place_data import ROWS
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.data import ROWS
+from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import preset

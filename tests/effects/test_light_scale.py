@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals, unbounded_scale
-from neilfpp_method.effects.material_grid import METALLICS
-from neilfpp_method.effects.place_data import ROWS
-from neilfpp_method.effects.place_fit import PlaceFit
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.data import ROWS
+from neilfpp_method.effects.places.fit import PlaceFit
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.grid import METALLICS
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Observed
 from tests.effects.balls import ball, data_of

@@ -10,13 +10,13 @@ import torch
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects.disagreement import RenderedSurface, shading_disagreement
-from neilfpp_method.effects.material import JUDGED
+from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shading_disagreement
+from neilfpp_method.effects.evidence.material import JUDGED
+from neilfpp_method.effects.evidence.visibility import self_visibility
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.effects.review import _rendered_surface, record_lamps, review_surface
-from neilfpp_method.effects.visibility import self_visibility
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields import environment
 from neilfpp_method.fields.direction_map import interpolate

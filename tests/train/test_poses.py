@@ -23,7 +23,7 @@ from neilfpp_method.train import evidence
 from neilfpp_method.train.loop import train
 from neilfpp_method.train.poses import camera_centers, corrected
 from neilfpp_method.train.run import load_run
-from tests.effects.test_poses import displacement, motions, rms
+from tests.effects.evidence.test_poses import displacement, motions, rms
 from tests.hard_cases.known_shapes import SHAPES, meet
 from tests.train.small_runs import differences, small_config, small_training
 from tests.train.test_resume import interrupt_at, run, state

@@ -21,9 +21,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.lit_places import METAL, PAINT, LitPlaces, light_up
-from neilfpp_method.effects.material_grid import BestMaterials
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.grid import BestMaterials
+from neilfpp_method.effects.places.lit import METAL, PAINT, LitPlaces, light_up
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.model import NeilfModel

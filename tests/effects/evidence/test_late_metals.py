@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.effects.lit_places import light_up
-from neilfpp_method.effects.metals import metals_evidence_in
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.evidence.metals import metals_evidence_in
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.effects.review import review_metals

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from neilfpp_method.effects.material_grid import ROUGHNESSES
-from neilfpp_method.effects.place_data import PlaceData
-from neilfpp_method.effects.place_fit import PlaceFit, mean_errors
-from neilfpp_method.effects.places import Split
+from neilfpp_method.effects.places.data import PlaceData
+from neilfpp_method.effects.places.fit import PlaceFit, mean_errors
+from neilfpp_method.effects.places.gathering import Split
+from neilfpp_method.effects.places.grid import ROUGHNESSES
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.fit import Evidence, evidence
 from neilfpp_method.lighting.lamp_transport import in_sight

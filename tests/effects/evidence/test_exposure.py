@@ -14,7 +14,7 @@ import torch
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.files.images import read_image, write_exr, write_png
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects.exposure import judge_gains, measure_exposures
+from neilfpp_method.effects.evidence.exposure import judge_gains, measure_exposures
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.effects.review import record_exposures

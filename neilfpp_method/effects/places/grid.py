@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.lighting.objective import FLOOR, OUTLIER
 from neilfpp_method.shading.brdf import DIELECTRIC_F0
 from neilfpp_method.structures import Material

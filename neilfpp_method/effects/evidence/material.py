@@ -2,7 +2,7 @@
 
 Places that many views show are fitted with all of these effects and without each of them. The fits use most
 of the views and are compared at pixels of the held-back views. The fits have no lamps; they have metals if
-the model has them (`effects.metals` decides).
+the model has them (`effects.evidence.metals` decides).
 
 The base colour of every place is free. A place without specular reflection therefore contains no information
 about the light, and the benefit of an environment map and of its colours is underestimated.
@@ -18,11 +18,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects.material_grid import ROUGHNESSES
+from neilfpp_method.effects.evidence.noise import lobe_noise
 from neilfpp_method.effects.measurement import Measurement, mean_of
-from neilfpp_method.effects.noise import lobe_noise
-from neilfpp_method.effects.place_data import PlaceData, place_transport
-from neilfpp_method.effects.place_fit import (
+from neilfpp_method.effects.places.data import PlaceData, place_transport
+from neilfpp_method.effects.places.fit import (
     FIRST_STEPS,
     ROUNDS,
     STEPS,
@@ -33,7 +32,8 @@ from neilfpp_method.effects.place_fit import (
     place_errors,
     seconds_of_step,
 )
-from neilfpp_method.effects.places import Split, gather_places
+from neilfpp_method.effects.places.gathering import Split, gather_places
+from neilfpp_method.effects.places.grid import ROUGHNESSES
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES
@@ -119,7 +119,7 @@ def seconds_of_evidence(device: torch.device) -> float:
     """Estimate the time of the measurements at places before one stage on this machine, in seconds.
 
     The estimate assumes that every place has `VIEWS` views. Most of the time goes to the descent on the
-    light, whose steps are timed (`place_fit.seconds_of_step`).
+    light, whose steps are timed (`places.fit.seconds_of_step`).
     """
     step = seconds_of_step(PLACES * VIEWS * (FOLDS - 1) // FOLDS, device)
     return (1 + REST) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step

@@ -9,10 +9,10 @@ such places prefer says nothing about the lobe.
 
 from __future__ import annotations
 
-from neilfpp_method.effects.alternatives import Alternative, reduction_in_held_back_views
+from neilfpp_method.effects.evidence.alternatives import Alternative, reduction_in_held_back_views
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.place_data import PlaceData, place_transport
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.data import PlaceData, place_transport
+from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import SceneTracer
 

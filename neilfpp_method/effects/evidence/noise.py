@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.measurement import Measurement, mean_of
-from neilfpp_method.effects.place_fit import PlaceFit
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.fit import PlaceFit
+from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.incident import Sources, arriving

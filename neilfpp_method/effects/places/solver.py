@@ -1,6 +1,6 @@
 """Initial light and searches for materials in a training loop without a data set of images.
 
-`effects.places.gather_places` asks a data set for the pixels that show a place. A loop into which NeILF++ is
+`gathering.gather_places` asks a data set for the pixels that show a place. A loop into which NeILF++ is
 attached hands over only batches of pixels. If many batches are remembered, most surface points have
 neighbours that other views showed, and neighbours together are a place.
 """
@@ -14,9 +14,9 @@ import torch
 from torch import nn
 
 from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
-from neilfpp_method.effects.material_search import is_search_due
-from neilfpp_method.effects.place_data import PlaceData, place_transport
-from neilfpp_method.effects.places import MIN_COSINE, SAME_NORMAL, Places
+from neilfpp_method.effects.places.data import PlaceData, place_transport
+from neilfpp_method.effects.places.gathering import MIN_COSINE, SAME_NORMAL, Places
+from neilfpp_method.effects.places.search import is_search_due
 from neilfpp_method.effects.review import improve_material
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.lighting.solver import LightSolver

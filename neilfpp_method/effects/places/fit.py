@@ -17,7 +17,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.material_grid import (
+from neilfpp_method.effects.places.data import ROWS, PlaceData
+from neilfpp_method.effects.places.grid import (
     METALLICS,
     MIN_BASE_COLOR,
     best_materials,
@@ -25,7 +26,6 @@ from neilfpp_method.effects.material_grid import (
     on_grid,
     relative_error,
 )
-from neilfpp_method.effects.place_data import ROWS, PlaceData
 from neilfpp_method.lighting.layered_transport import layers_at
 from neilfpp_method.lighting.objective import OUTLIER, total_variation
 from neilfpp_method.lighting.transport import Transport

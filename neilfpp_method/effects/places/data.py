@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from neilfpp_method.effects.material_grid import ROUGHNESSES
-from neilfpp_method.effects.places import Places, Split
+from neilfpp_method.effects.places.gathering import Places, Split
+from neilfpp_method.effects.places.grid import ROUGHNESSES
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.layered_transport import texel_layers
 from neilfpp_method.lighting.transport import Transport

@@ -7,12 +7,12 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.effects.material import WORTH, judge_material
-from neilfpp_method.effects.material_grid import METALLICS
-from neilfpp_method.effects.noise import lobe_noise
-from neilfpp_method.effects.place_data import ROWS
-from neilfpp_method.effects.place_fit import Permitted, PlaceFit, fit_places, place_errors
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.evidence.material import WORTH, judge_material
+from neilfpp_method.effects.evidence.noise import lobe_noise
+from neilfpp_method.effects.places.data import ROWS
+from neilfpp_method.effects.places.fit import Permitted, PlaceFit, fit_places, place_errors
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.grid import METALLICS
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.settings.presets import preset

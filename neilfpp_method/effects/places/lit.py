@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.effects.material_grid import (
+from neilfpp_method.effects.places.gathering import Places, Split
+from neilfpp_method.effects.places.grid import (
     METALLICS,
     ROUGHNESSES,
     BestMaterials,
@@ -17,7 +18,6 @@ from neilfpp_method.effects.material_grid import (
     neighbors,
     relative_error,
 )
-from neilfpp_method.effects.places import Places, Split
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.layered_transport import layers_at, light_layers
 from neilfpp_method.lighting.objective import DARK_FLOOR

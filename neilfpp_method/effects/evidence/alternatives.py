@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neilfpp_method.effects.light_scale import unbounded_scale
 from neilfpp_method.effects.measurement import Measurement, mean_reduction
-from neilfpp_method.effects.place_data import PlaceData
-from neilfpp_method.effects.place_fit import Permitted, fit_places, mean_errors
+from neilfpp_method.effects.places.data import PlaceData
+from neilfpp_method.effects.places.fit import Permitted, fit_places, mean_errors
 
 __all__ = ["Alternative", "reduction_in_held_back_views"]
 

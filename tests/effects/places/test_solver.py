@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from neilfpp_method.attach import attach_neilf, pixel_batch
-from neilfpp_method.effects import place_solver
-from neilfpp_method.effects.place_solver import PlaceSolver
+from neilfpp_method.effects.places import solver as place_solver
+from neilfpp_method.effects.places.solver import PlaceSolver
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.shading import LOBES
 from tests.effects.balls import ball

@@ -8,14 +8,14 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.effects.material_search import (
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.search import (
     SEARCH_AT,
     SearchedMaterial,
     is_search_due,
     search_materials,
     teach,
 )
-from neilfpp_method.effects.places import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.model import NeilfModel

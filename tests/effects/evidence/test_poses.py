@@ -12,9 +12,9 @@ from torch.nn.functional import normalize
 from neilfpp_method.data.cameras.projection import camera_rays
 from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.evidence.poses import pixel_angles
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.pose_fit import _render, fit_poses
-from neilfpp_method.effects.poses import pixel_angles
 from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.effects.review import POSE_STEPS, review_poses
 from neilfpp_method.errors import UserError

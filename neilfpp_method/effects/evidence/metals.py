@@ -25,12 +25,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.effects.alternatives import Alternative, reduction_in_held_back_views
-from neilfpp_method.effects.lit_places import METAL, PAINT, LitPlaces
-from neilfpp_method.effects.material_grid import BestMaterials
-from neilfpp_method.effects.material_search import SearchedMaterial, found_in
+from neilfpp_method.effects.evidence.alternatives import Alternative, reduction_in_held_back_views
 from neilfpp_method.effects.measurement import Measurement, mean_reduction
-from neilfpp_method.effects.place_data import PlaceData
+from neilfpp_method.effects.places.data import PlaceData
+from neilfpp_method.effects.places.grid import BestMaterials
+from neilfpp_method.effects.places.lit import METAL, PAINT, LitPlaces
+from neilfpp_method.effects.places.search import SearchedMaterial, found_in
 from neilfpp_method.fields.brdf import BrdfField
 
 __all__ = ["find_metal", "metals_evidence", "metals_evidence_in"]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from neilfpp_method.effects.place_data import DIRECTIONS, ROWS, place_transport
-from neilfpp_method.effects.places import Places
+from neilfpp_method.effects.places.data import DIRECTIONS, ROWS, place_transport
+from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Observed, SceneLight
 from tests.effects.balls import ball

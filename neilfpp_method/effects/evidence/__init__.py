@@ -1,0 +1,1 @@
+"""Evidence for or against each effect: one module for each question."""

@@ -1,0 +1,1 @@
+"""Places: surface points with their pixels in many views, to which light and materials are fitted."""
