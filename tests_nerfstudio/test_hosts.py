@@ -18,7 +18,7 @@ from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts import proxy
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
-from neilfpp_method.plugin import model as plugin_model
+from neilfpp_method.plugin import steps as plugin_steps
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.schedule import Stage
 from neilfpp_method.structures import RayBatch
@@ -34,7 +34,7 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Measurements with few rays: NeuS takes half a minute for 512 rays on a busy core."""
     monkeypatch.setattr(proxy, "EXPLORING_BATCHES", 1)
     monkeypatch.setattr(proxy, "EXPLORING_RAYS", 16)
-    monkeypatch.setattr(plugin_model, "CHECKED_PIXELS", 16)
+    monkeypatch.setattr(plugin_steps, "CHECKED_PIXELS", 16)
 
 
 CENTER, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5

@@ -13,7 +13,9 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.plugin.model import NeilfMethod
+from neilfpp_method.plugin.steps import Steps
 from neilfpp_method.schedule import Stage
+from neilfpp_method.structures import LossTerms, PixelBatch
 from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint, load_weights
 from neilfpp_method.train.health_record import read_findings
 from neilfpp_method.train.rerun import rerun_step
@@ -74,15 +76,20 @@ def test_health_is_checked(run: Path) -> None:
 def test_a_step_that_is_not_finite_is_skipped_and_can_be_repeated(
     data: Path, tmp_path: Path, capsys, monkeypatch
 ) -> None:
-    losses, terms = NeilfMethod.get_loss_dict, {}
+    compute, losses, terms = Steps.compute, NeilfMethod.get_loss_dict, {}
+
+    def kept_terms(self: Steps, pixels: PixelBatch) -> LossTerms:
+        computed = compute(self, pixels)
+        if self.number == 6:
+            terms.update({name: term.values.detach() for name, term in computed.items()})
+        return computed
 
     def spoilt(self: NeilfMethod, *arguments: object) -> dict[str, torch.Tensor]:
         weighted = losses(self, *arguments)
-        if not self.training or self.step != 6:
-            return weighted
-        terms.update({name: term.values.detach() for name, term in self.computed.terms.items()})
-        return {name: torch.nan * loss for name, loss in weighted.items()}
+        spoils = self.training and self.steps.number == 6
+        return {name: torch.nan * loss for name, loss in weighted.items()} if spoils else weighted
 
+    monkeypatch.setattr(Steps, "compute", kept_terms)
     monkeypatch.setattr(NeilfMethod, "get_loss_dict", spoilt)
     ended = ns_train(trainer_config(data, tmp_path, small_settings()))
     said = " ".join(capsys.readouterr().out.split())
