@@ -16,9 +16,9 @@ from rich.console import Console
 
 from neilfpp_method.commands import COMMANDS
 from neilfpp_method.commands.command import Command
-from neilfpp_method.commands.ending import CLOSED_OUTPUT, ended_by_signal, output_is_closed
+from neilfpp_method.commands.ending import CLOSED_OUTPUT, ended_by_signal, forget_interrupt, output_is_closed
 from neilfpp_method.commands.mistakes import TYRO_UNKNOWN, closest, mistake
-from neilfpp_method.data.cameras.native_signals import sigterm_delayed
+from neilfpp_method.data.native_signals import signals_delayed
 from neilfpp_method.errors import EarlyEnd, Stopped, UserError
 
 __all__ = ["main"]
@@ -64,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not ending.number and not isinstance(error, KeyboardInterrupt):
                 raise
             errors.print("stopped")
+            forget_interrupt()
             return ending.status if ending.number else Stopped.status
     return 0
 
@@ -81,8 +82,8 @@ def _run(name: str, arguments: Sequence[str]) -> None:
     command = COMMANDS[name]
     try:
         options = _resolve_run_folder(_parse(name, command, arguments))
-        # Threads that numpy starts inherit the blocked SIGTERM, so only the main thread receives it.
-        with sigterm_delayed():
+        # Threads that numpy starts inherit the blocked signals, so only the main thread receives them.
+        with signals_delayed():
             import numpy  # noqa: F401
         command.run(options)
     except OSError as error:

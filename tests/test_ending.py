@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -14,8 +15,10 @@ from rich.console import Console
 
 from neilfpp_method.cli import main
 from neilfpp_method.commands import COMMANDS
-from neilfpp_method.data.cameras.native_signals import sigterm_delayed
 from neilfpp_method.data.files.atomic_file import replacing
+from neilfpp_method.data.native_signals import signals_delayed
+
+REPOSITORY = Path(__file__).parent.parent
 
 
 @dataclass
@@ -134,17 +137,75 @@ def test_other_errors_are_shown(monkeypatch):
         main(command(monkeypatch, fail))
 
 
-def test_sigterm_waits_for_a_library_that_installs_its_own_handler():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_wait_for_a_library_that_installs_its_own_handler(number):
     told: list[str] = []
-    before = signal.signal(signal.SIGTERM, lambda *_: told.append("ours"))
+    before = signal.signal(number, lambda *_: told.append("ours"))
     try:
-        with sigterm_delayed():
-            signal.signal(signal.SIGTERM, lambda *_: told.append("the library's"))
-            signal.raise_signal(signal.SIGTERM)
+        with signals_delayed():
+            signal.signal(number, lambda *_: told.append("the library's"))
+            signal.raise_signal(number)
             assert told == []
         assert told == ["ours"]
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(number, before)
+
+
+IN_USD = """
+import os, signal, sys
+from importlib._bootstrap_external import FileFinder
+
+def raising(number, frame):
+    raise KeyboardInterrupt
+
+fill = FileFinder._fill_cache
+
+def interrupting(self):
+    if self.path.endswith(os.path.join("pxr", "Plug")):
+        os.kill(os.getpid(), signal.{signal})
+    return fill(self)
+
+signal.signal(signal.{signal}, raising)
+FileFinder._fill_cache = interrupting
+try:
+    import neilfpp_method.export.asset.usd
+except KeyboardInterrupt:
+    sys.exit(5)
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_a_signal_while_usd_is_loaded_is_not_swallowed(number):
+    """USD's loader of modules catches exceptions, prints them, and goes on without the module."""
+    program = IN_USD.format(signal=number)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (5, "")
+
+
+IN_CODE_FROM_A_STRING = """
+import dataclasses, os, signal, sys
+from neilfpp_method.__main__ import main
+from neilfpp_method.commands import COMMANDS
+
+@dataclasses.dataclass
+class Nothing:
+    pass
+
+def run(options):
+    exec("import os, signal; os.kill(os.getpid(), signal.SIGTERM)")
+
+COMMANDS["inspect"] = dataclasses.replace(COMMANDS["inspect"], options=Nothing, run=run)
+sys.exit(main())
+"""
+
+
+def test_the_exit_status_stands_after_a_signal_in_code_from_a_string(tmp_path: Path):
+    """Otherwise `python -m` ends by SIGINT."""
+    (tmp_path / "interrupted.py").write_text(IN_CODE_FROM_A_STRING)
+    command = [sys.executable, "-m", "interrupted", "inspect"]
+    here = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{REPOSITORY}"}
+    done = subprocess.run(command, capture_output=True, text=True, env=here)
+    assert (done.returncode, done.stderr) == (143, "stopped\n")
 
 
 def test_a_stopped_write_keeps_the_old_file(monkeypatch, tmp_path: Path):

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-__all__ = ["CLOSED_OUTPUT", "EndSignal", "ended_by_signal", "output_is_closed"]
+__all__ = ["CLOSED_OUTPUT", "EndSignal", "ended_by_signal", "forget_interrupt", "output_is_closed"]
 
 CLOSED_OUTPUT = 141
 """The exit status that shells report for a process whose output is no longer read: 128 + SIGPIPE."""
@@ -76,6 +76,16 @@ def ended_by_signal() -> Iterator[EndSignal]:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def forget_interrupt() -> None:
+    """Let the exit status stand after a handled `KeyboardInterrupt`.
+
+    Python remembers a `KeyboardInterrupt` that leaves code which a string or a native library ran, even if it
+    is handled later, and `python -m` then ends by SIGINT whatever the status. To run other code in this way
+    clears it.
+    """
+    exec("")
 
 
 def output_is_closed() -> bool:

@@ -4,7 +4,7 @@ If pycolmap is loaded before OpenCV, its own zlib is used by OpenCV's PNG writer
 "free(): invalid pointer". OpenCV is therefore imported first, here.
 
 pycolmap installs a handler that prints a stack trace on SIGTERM. The previous handler is restored, and a
-SIGTERM that arrives during the import is delivered afterwards.
+signal that arrives during the import is delivered afterwards.
 
 The interface of pycolmap changes between versions, so unsupported versions are refused at the import and not
 in the middle of a command.
@@ -12,10 +12,10 @@ in the middle of a command.
 
 from __future__ import annotations
 
-from neilfpp_method.data.cameras.native_signals import sigterm_delayed
+from neilfpp_method.data.native_signals import signals_delayed
 from neilfpp_method.errors import UserError
 
-with sigterm_delayed():
+with signals_delayed():
     import cv2  # noqa: F401
     import pycolmap
 

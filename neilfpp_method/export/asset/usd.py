@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from neilfpp_method.data.native_signals import signals_delayed
 from neilfpp_method.export.asset.atlas import Unwrapped
 
 try:
-    from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
+    with signals_delayed():
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 # usd-core is optional: the extra `usd`.
 except ImportError:
     Usd = None
