@@ -8,8 +8,9 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.schedule import Stage, StagePosition, active_losses, weigh
 from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step
+from neilfpp_method.train.vanished import restore_surface
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 
@@ -97,6 +98,7 @@ def test_one_extreme_pixel_and_one_ray(odd, rays):
 @pytest.mark.timeout(900)
 @pytest.mark.usefixtures("without_shape_checks")
 def test_ten_thousand_steps_with_beta_at_its_floor():
+    """The surface is restored when it vanishes, as in the training loop."""
     config = tiny_config()
     model = sphere_model(
         dataclasses.replace(config, volume=dataclasses.replace(config.volume, beta_init=1.0001e-4))
@@ -116,6 +118,7 @@ def test_ten_thousand_steps_with_beta_at_its_floor():
         norms = torch.stack(list(gradient_norms(model).values()))
         assert norms.isfinite().all(), step
         optimizer.step()
+        restore_surface(model.host, StagePosition(Stage.SDF_INIT, step + 1, 10_000))
     assert 1e-4 <= model.host.density.beta().item() < 1.001e-4
     # The images have one colour, which R must have learned.
     assert (model.host.render(batches[0].rays).color - 0.3).abs().mean() < 0.05
