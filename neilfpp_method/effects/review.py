@@ -150,15 +150,16 @@ def review_light(
 
 def _review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) -> LightReview:
     """`review_light` at given places, with the model in evaluation mode."""
-    typical, decisions, first = model.facts.median_radiance, [], None
+    facts, decisions, first = model.facts, [], None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
-        measured = lobe_evidence(places, model.scene, typical, model.brdf.metals)
+        measured = lobe_evidence(places, model.scene, facts, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step))
         model.use(plan.config)
     if model.lobe is not None:
-        data = PlaceData(places, place_transport(places, model.lobe, model.scene), typical)
+        transport = place_transport(places, model.lobe, model.scene)
+        data = PlaceData(places, transport, facts.median_radiance, facts.response)
         if plan.is_open("metals") and model.brdf.metals:
-            measured = metals_evidence(data, model.facts.response)
+            measured = metals_evidence(data)
             decisions.append(plan.decide("metals", measured, step))
             model.use(plan.config)
         first = find_first_light(data, model.brdf.metals)

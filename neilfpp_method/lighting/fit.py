@@ -17,7 +17,7 @@ from torch import Tensor
 
 from neilfpp_method.lighting.decision import is_worthwhile
 from neilfpp_method.lighting.descent import Unknown, descend
-from neilfpp_method.lighting.objective import Objective, Target
+from neilfpp_method.lighting.objective import Objective, Target, white_balance
 from neilfpp_method.lighting.transport import Transport
 
 __all__ = [
@@ -161,7 +161,10 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
         strength = torch.where(set_by_images, strength, strength.detach())
         loss = objective.misfit(strength, transport, target, gain)
         loss = loss + objective.map_prior(log_radiance.expand_as(start.log_radiance))
-        return loss + objective.lamp_prior(unit * root.square().mean(-1), mean_transport @ strength)
+        contribution = mean_transport[:, None] * strength
+        all_light = contribution.sum(0)
+        loss = loss + white_balance(contribution, all_light, objective.response)
+        return loss + objective.lamp_prior(unit * root.square().mean(-1), all_light)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))
     end = descend(unknowns, GAIN_RATE * RATE, objective.steps, target, objective, loss_of)

@@ -31,6 +31,7 @@ __all__ = [
     "tint",
     "total_variation",
     "unevenness",
+    "white_balance",
 ]
 
 FLOOR = 0.1
@@ -60,6 +61,12 @@ WHITENESS = 0.05
 """Weight of the tint of all light that reaches the points, relative to the relative error: images hardly
 determine how the tint is shared between light and surfaces.
 """
+BALANCE = 0.1
+"""Weight of the mean tint of the single sources in photographs with display values, relative to the data
+term: cameras balance white.
+"""
+PALE_SHARE = 0.01
+"""White light, as a share of the brightness of a source, that is added to its colour before the logarithm."""
 LINEAR_SHARE = 0.02
 """Share of all light below which the sparsity prior of a lamp is about linear; above, it is logarithmic."""
 NEIGHBORS = 4
@@ -207,6 +214,27 @@ def unevenness(base_color: Float[Tensor, "N 3"], nearest: Int[Tensor, "N K"]) ->
 
 def _smooth_abs(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
     return (difference.square() + QUADRATIC_BELOW**2).sqrt()
+
+
+def white_balance(
+    contribution: Float[Tensor, "T 3"], all_light: Float[Tensor, " 3"], response: str
+) -> Float[Tensor, ""]:
+    """Prior on the colours of single sources if the images have display values, else 0.
+
+    The prior is the mean deviation of the sources from white, as in `tint`. Coloured sources may add up to
+    white light, such as an orange sky and a blue lamp, and then tint surfaces by their orientation.
+
+    Args:
+        contribution: mean light that each source brings to the points.
+        all_light: mean light that all sources bring to the points; a source counts by its share of it.
+        response: response of the capture, "linear" or "srgb".
+    """
+    if response != "srgb":
+        return all_light.new_zeros(())
+    brightness = contribution.mean(-1, keepdim=True)
+    relative = contribution / brightness.clamp_min(1e-20) + PALE_SHARE
+    share = brightness[:, 0] / all_light.mean()
+    return BALANCE * (share * relative.log().var(-1, correction=0)).sum()
 
 
 def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:

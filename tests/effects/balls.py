@@ -49,10 +49,10 @@ def ball(
     return Places(count, place, torch.arange(views).repeat(count), Observed(normal, normal, wo, pixel))
 
 
-def data_of(places: Places, lobe: Lobe) -> PlaceData:
+def data_of(places: Places, lobe: Lobe, response: str = "linear") -> PlaceData:
     """The data of a fit to places that have no neighbours in the way of their light."""
     typical = places.observed.pixel.median().item()
-    return PlaceData(places, place_transport(places, lobe, None), typical)
+    return PlaceData(places, place_transport(places, lobe, None), typical, response)
 
 
 def _rendered(

@@ -16,6 +16,7 @@ from neilfpp_method.effects.places.data import ROWS
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.lighting.solver import NothingToSolve
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Material, Observed
@@ -61,7 +62,8 @@ def test_held_back_views_identify_the_lobe_of_the_images():
 
     def gain(lobe: str) -> Measurement:
         places = ball(color, 0.36 * ones, ones, LOBES[lobe], views=16)
-        return lobe_evidence(places, None, places.observed.pixel.median().item(), metals=True)
+        facts = SceneFacts("linear", places.observed.pixel.median().item(), 3.0, "constant")
+        return lobe_evidence(places, None, facts, metals=True)
 
     of_ggx, of_gaussian = gain("ggx"), gain("spherical_gaussian")
     assert of_ggx.value > 2 * of_ggx.deviation
@@ -73,7 +75,7 @@ def test_held_back_views_distinguish_metals_from_paint():
     lobe = LOBES["ggx"]
 
     def gain(places: Places, response: str = "linear") -> Measurement:
-        return metals_evidence(data_of(places, lobe), response)
+        return metals_evidence(data_of(places, lobe, response))
 
     mixed = gain(patched("ggx"))
     assert mixed.favours(chosen=True)

@@ -11,7 +11,15 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.fit import Evidence, MapAndLamps, fit_light
 from neilfpp_method.lighting.map_transport import from_texels
-from neilfpp_method.lighting.objective import Objective, Target, nearest_points, total_variation, unevenness
+from neilfpp_method.lighting.objective import (
+    Objective,
+    Target,
+    nearest_points,
+    tint,
+    total_variation,
+    unevenness,
+    white_balance,
+)
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.shading.rendering_equation import shade
@@ -196,3 +204,34 @@ def test_a_map_without_a_finite_solution_is_unchanged():
     broken = torch.full((8, 3), math.inf)
     fit(environment, carried, Target(seen.position, of, broken), 1.0, steps=3)
     assert torch.equal(environment.log_radiance, before)
+
+
+ORANGE_AND_BLUE = torch.tensor([[1.6, 1.0, 0.4], [0.4, 1.0, 1.6]])
+
+
+def test_coloured_sources_that_add_up_to_white_are_not_balanced():
+    all_light = ORANGE_AND_BLUE.sum(0)
+    assert tint(all_light) < 1e-12
+    assert white_balance(ORANGE_AND_BLUE, all_light, "srgb") > 0.02
+    grey = ORANGE_AND_BLUE.mean(-1, keepdim=True).expand(2, 3)
+    assert white_balance(grey, grey.sum(0), "srgb") < 1e-12
+    # Linear radiance was not balanced by a camera.
+    assert white_balance(ORANGE_AND_BLUE, all_light, "linear") == 0
+
+
+def test_white_balance_does_not_depend_on_the_unit_and_counts_sources_by_their_light():
+    all_light = ORANGE_AND_BLUE.sum(0)
+    whole = white_balance(ORANGE_AND_BLUE, all_light, "srgb")
+    torch.testing.assert_close(white_balance(1e4 * ORANGE_AND_BLUE, 1e4 * all_light, "srgb"), whole)
+    # The same light from four sources, and beside as much white light.
+    torch.testing.assert_close(white_balance(ORANGE_AND_BLUE.repeat(2, 1) / 2, all_light, "srgb"), whole)
+    torch.testing.assert_close(white_balance(ORANGE_AND_BLUE, 2 * all_light, "srgb"), whole / 2)
+
+
+def test_gradient_of_white_balance():
+    torch.manual_seed(0)
+    contribution = (torch.rand(5, 3, dtype=torch.float64) + 0.05).requires_grad_()
+    torch.autograd.gradcheck(lambda c: white_balance(c, c.sum(0), "srgb"), contribution)
+    dark = torch.zeros(2, 3, requires_grad=True)
+    white_balance(dark, torch.ones(3), "srgb").backward()
+    assert dark.grad.isfinite().all()

@@ -13,6 +13,7 @@ from neilfpp_method.effects.evidence.alternatives import Alternative, reduction_
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.places.data import PlaceData, place_transport
 from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import SceneTracer
 
@@ -26,17 +27,19 @@ is enough.
 """
 
 
-def lobe_evidence(places: Places, scene: SceneTracer | None, typical: float, metals: bool) -> Measurement:
+def lobe_evidence(places: Places, scene: SceneTracer | None, facts: SceneFacts, metals: bool) -> Measurement:
     """Mean reduction of the relative error of the places by GGX against the Gaussian, in held-back views.
 
     Args:
         places: places in the training views, with linear radiance.
         scene: traces rays through the scene; None without inter-reflection.
-        typical: radiance of a typical pixel.
+        facts: what was measured in the images.
         metals: whether metallic may be greater than 0.
     """
-    gaussian, ggx = (
-        Alternative(PlaceData(places, place_transport(places, LOBES[name], scene), typical), metals)
-        for name in ("spherical_gaussian", "ggx")
-    )
+
+    def alternative(lobe: str) -> Alternative:
+        transport = place_transport(places, LOBES[lobe], scene)
+        return Alternative(PlaceData(places, transport, facts.median_radiance, facts.response), metals)
+
+    gaussian, ggx = alternative("spherical_gaussian"), alternative("ggx")
     return reduction_in_held_back_views(gaussian, ggx, FOLDS, FOLDS, "GGX", WORTH)

@@ -108,7 +108,7 @@ def material_evidence(
     if not len(places.place):
         return {name: Measurement("views of the same place", 0.0, 0.0, WORTH, 0) for name in names}
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)
-    data = PlaceData(places, transport, model.facts.median_radiance)
+    data = PlaceData(places, transport, model.facts.median_radiance, model.facts.response)
     judged = judge_material(data, names, model.brdf.metals)
     if "lobe-sampling" not in names:
         return judged.measured

@@ -59,15 +59,10 @@ best paint. In the demo this selects half of the metal and 7 % of the paint; a r
 """
 
 
-def metals_evidence(data: PlaceData, response: str) -> Measurement:
-    """Mean reduction of the relative error of the places by metals, in held-back views.
-
-    Args:
-        data: the places.
-        response: meaning of the pixel values of the capture, as in `SceneFacts`.
-    """
+def metals_evidence(data: PlaceData) -> Measurement:
+    """Mean reduction of the relative error of the places by metals, in held-back views."""
     paint, metal = Alternative(data, metals=False), Alternative(data, metals=True)
-    worth = WORTH_IN_DISPLAY_VALUES if response == "srgb" else WORTH
+    worth = WORTH_IN_DISPLAY_VALUES if data.response == "srgb" else WORTH
     return reduction_in_held_back_views(paint, metal, FOLDS, TURNS, "metals", worth)
 
 

@@ -35,15 +35,17 @@ class PlaceData:
         places: places with their pixels, in linear radiance.
         transport: the transport to these pixels (`place_transport`).
         typical: radiance of a typical pixel.
+        response: response of the capture from which the pixels come, "linear" or "srgb".
     """
 
     places: Places
     transport: Transport
     typical: float
+    response: str
 
     def where(self, rows: Tensor) -> PlaceData:
         """The same places with only some of the pixels."""
-        return PlaceData(self.places.where(rows), self.transport[rows], self.typical)
+        return PlaceData(self.places.where(rows), self.transport[rows], self.typical, self.response)
 
     def hold_back(self, fold: int, folds: int) -> Split[PlaceData]:
         """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""

@@ -27,7 +27,7 @@ from neilfpp_method.effects.places.grid import (
     relative_error,
 )
 from neilfpp_method.lighting.layered_transport import layers_at
-from neilfpp_method.lighting.objective import OUTLIER, total_variation
+from neilfpp_method.lighting.objective import OUTLIER, total_variation, white_balance
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.structures import Material
 
@@ -172,6 +172,7 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
     place = data.places.place
     selected = _at_roughness(data.transport, fit.roughness[place])
     material = fit.material(place)
+    mean_transport = selected.sources[0].mean(0)
     log_radiance = fit.log_radiance.clone().requires_grad_()
     gain = torch.zeros_like(fit.base_color, requires_grad=True)
     groups = [{"params": [log_radiance], "lr": RATE}, {"params": [gain], "lr": GAIN_RATE}]
@@ -180,10 +181,13 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
         for _ in range(steps):
             base_color = fit.base_color * gain.exp()
             candidate = replace(material, base_color=base_color.clamp(0, 1)[place])
-            outgoing = selected.outgoing(candidate, permitted.form(log_radiance).exp().flatten(1).t())
+            radiance = permitted.form(log_radiance).exp().flatten(1).t()
+            outgoing = selected.outgoing(candidate, radiance)
             error = relative_error(outgoing, data.places, data.typical)
             loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
+            contribution = mean_transport[:, None] * radiance
+            loss = loss + white_balance(contribution, contribution.sum(0), data.response)
             loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
             if permitted.mean_base_color is not None:
                 off = _log_mean(base_color) - math.log(permitted.mean_base_color)

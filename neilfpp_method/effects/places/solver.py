@@ -110,7 +110,7 @@ class PlaceSolver(nn.Module):
         rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
         self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")
         transport = place_transport(places, model.lobe, model.scene)
-        data = PlaceData(places, transport, model.facts.median_radiance)
+        data = PlaceData(places, transport, model.facts.median_radiance, model.facts.response)
         first = find_first_light(data, model.brdf.metals)
         if first is not None:
             self.say(first.summary())
