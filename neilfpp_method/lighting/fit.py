@@ -163,7 +163,7 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
         loss = loss + objective.map_prior(log_radiance.expand_as(start.log_radiance))
         contribution = mean_transport[:, None] * strength
         all_light = contribution.sum(0)
-        loss = loss + white_balance(contribution, all_light, objective.response)
+        loss = loss + white_balance(contribution[reaching_any < texels], all_light, objective.response)
         return loss + objective.lamp_prior(unit * root.square().mean(-1), all_light)
 
     unknowns = (Unknown(log_radiance, RATE), Unknown(root, ROOT_RATE * RATE))

@@ -62,11 +62,11 @@ WHITENESS = 0.05
 determine how the tint is shared between light and surfaces.
 """
 BALANCE = 0.1
-"""Weight of the mean tint of the single sources in photographs with display values, relative to the data
-term: cameras balance white.
+"""Weight of the mean tint of the map's texels in photographs with display values, relative to the data term:
+cameras balance white.
 """
 PALE_SHARE = 0.01
-"""White light, as a share of the brightness of a source, that is added to its colour before the logarithm."""
+"""White light, as a share of the brightness of a texel, that is added to its colour before the logarithm."""
 LINEAR_SHARE = 0.02
 """Share of all light below which the sparsity prior of a lamp is about linear; above, it is logarithmic."""
 NEIGHBORS = 4
@@ -219,14 +219,14 @@ def _smooth_abs(difference: Float[Tensor, ...]) -> Float[Tensor, ...]:
 def white_balance(
     contribution: Float[Tensor, "T 3"], all_light: Float[Tensor, " 3"], response: str
 ) -> Float[Tensor, ""]:
-    """Prior on the colours of single sources if the images have display values, else 0.
+    """Prior on the colours of a map if the images have display values, else 0.
 
-    The prior is the mean deviation of the sources from white, as in `tint`. Coloured sources may add up to
+    The prior is the mean deviation of the texels from white, as in `tint`. Coloured sources may add up to
     white light, such as an orange sky and a blue lamp, and then tint surfaces by their orientation.
 
     Args:
-        contribution: mean light that each source brings to the points.
-        all_light: mean light that all sources bring to the points; a source counts by its share of it.
+        contribution: mean light that each texel brings to the points.
+        all_light: mean light that all sources bring to the points; a texel counts by its share of it.
         response: response of the capture, "linear" or "srgb".
     """
     if response != "srgb":

@@ -20,7 +20,7 @@ from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
 from neilfpp_method.lighting.descent import Unknown, descend
 from neilfpp_method.lighting.fit_points import FitPoints
-from neilfpp_method.lighting.objective import Objective, Target, white_balance
+from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.frame import safe_normalize
 
@@ -87,9 +87,8 @@ def settle_lamps(
         kernel = points.lamp_kernel(lamps.places, radius, sight)
         contribution = kernel[0].mean(0)[:, None] * lamps.intensity
         all_light = contribution.sum(0) + beside.scene[0].mean(0)
-        loss = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
-        loss = loss + white_balance(contribution, all_light, objective.response)
-        return loss + objective.lamp_prior(contribution.mean(-1), all_light)
+        misfit = objective.misfit(lamps.intensity, Transport(kernel, beside.scene), target, gain)
+        return misfit + objective.lamp_prior(contribution.mean(-1), all_light)
 
     def settle(lamps: FoundLamps) -> _Settled:
         # Visibility is not differentiated: it is computed once per descent, at the initial positions.

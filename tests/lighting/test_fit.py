@@ -209,7 +209,7 @@ def test_a_map_without_a_finite_solution_is_unchanged():
 ORANGE_AND_BLUE = torch.tensor([[1.6, 1.0, 0.4], [0.4, 1.0, 1.6]])
 
 
-def test_coloured_sources_that_add_up_to_white_are_not_balanced():
+def test_coloured_texels_that_add_up_to_white_are_not_balanced():
     all_light = ORANGE_AND_BLUE.sum(0)
     assert tint(all_light) < 1e-12
     assert white_balance(ORANGE_AND_BLUE, all_light, "srgb") > 0.02
@@ -219,11 +219,11 @@ def test_coloured_sources_that_add_up_to_white_are_not_balanced():
     assert white_balance(ORANGE_AND_BLUE, all_light, "linear") == 0
 
 
-def test_white_balance_does_not_depend_on_the_unit_and_counts_sources_by_their_light():
+def test_white_balance_does_not_depend_on_the_unit_and_counts_texels_by_their_light():
     all_light = ORANGE_AND_BLUE.sum(0)
     whole = white_balance(ORANGE_AND_BLUE, all_light, "srgb")
     torch.testing.assert_close(white_balance(1e4 * ORANGE_AND_BLUE, 1e4 * all_light, "srgb"), whole)
-    # The same light from four sources, and beside as much white light.
+    # The same light from four texels, and beside as much white light.
     torch.testing.assert_close(white_balance(ORANGE_AND_BLUE.repeat(2, 1) / 2, all_light, "srgb"), whole)
     torch.testing.assert_close(white_balance(ORANGE_AND_BLUE, 2 * all_light, "srgb"), whole / 2)
 
