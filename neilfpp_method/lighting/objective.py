@@ -234,9 +234,9 @@ def white_balance(
     brightness = contribution.mean(-1, keepdim=True)
     relative = contribution / brightness.clamp_min(1e-20) + PALE_SHARE
     share = brightness[:, 0] / all_light.mean()
-    return BALANCE * (share * relative.log().var(-1, correction=0)).sum()
+    return BALANCE * (share * tint(relative)).sum()
 
 
-def tint(light: Float[Tensor, " 3"]) -> Float[Tensor, ""]:
-    """Deviation of a colour from white: the variance of its logarithm over the channels."""
-    return light.clamp_min(1e-20).log().var(correction=0)
+def tint(light: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
+    """Deviation of colours from white: the variance of their logarithms over the channels."""
+    return light.clamp_min(1e-20).log().var(-1, correction=0)
