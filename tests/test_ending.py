@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -129,6 +132,38 @@ def test_exceptions_of_libraries_after_ctrl_c_are_not_shown(monkeypatch, capfd):
     assert capfd.readouterr().err == "stopped\n"
 
 
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_a_callback_of_a_library_ends_the_command(monkeypatch, capfd, number, status):
+    """Python ignores exceptions in callbacks from C, such as those of Numba's compiler."""
+    times = []
+
+    @ctypes.CFUNCTYPE(None)
+    def callback() -> None:
+        times.append(time.monotonic())
+        if len(times) == 1:
+            signal.raise_signal(number)
+        time.sleep(0.2)
+
+    def work(_: object) -> None:
+        callback()
+        callback()
+        time.sleep(30)
+
+    assert main(command(monkeypatch, work)) == status
+    assert capfd.readouterr().err == "stopped\n"
+    assert time.monotonic() - times[0] < 20
+
+
+def test_other_exceptions_in_a_callback_are_shown(monkeypatch, capfd):
+    @ctypes.CFUNCTYPE(None)
+    def callback() -> None:
+        raise ValueError("a fault of ours")
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
+    assert main(command(monkeypatch, lambda _: callback())) == 0
+    assert "a fault of ours" in capfd.readouterr().err
+
+
 def test_other_errors_are_shown(monkeypatch):
     def fail(_: object) -> None:
         raise ImportError("a fault of ours")
@@ -149,6 +184,24 @@ def test_signals_wait_for_a_library_that_installs_its_own_handler(number):
         assert told == ["ours"]
     finally:
         signal.signal(number, before)
+
+
+def test_signals_wait_that_another_thread_receives():
+    """Threads from before the block do not block the signals, as those of OpenBLAS."""
+    told: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+    done = threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    try:
+        with signals_delayed():
+            signal.pthread_kill(other.ident, signal.SIGTERM)
+            time.sleep(0.1)
+            assert told == []
+        assert told == [signal.SIGTERM]
+    finally:
+        done.set()
+        signal.signal(signal.SIGTERM, before)
 
 
 IN_USD = """

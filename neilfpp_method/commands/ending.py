@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import _thread
 import os
 import select
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
@@ -13,6 +15,8 @@ __all__ = ["CLOSED_OUTPUT", "EndSignal", "ended_by_signal", "forget_interrupt", 
 
 CLOSED_OUTPUT = 141
 """The exit status that shells report for a process whose output is no longer read: 128 + SIGPIPE."""
+AGAIN = 0.05
+"""Time after which a signal whose exception was ignored is raised once more, in seconds."""
 
 
 class EndSignal:
@@ -25,6 +29,8 @@ class EndSignal:
     def __init__(self) -> None:
         self.number = 0
         self._raises = False
+        self._hook = sys.unraisablehook
+        self._again: threading.Timer | None = None
 
     @property
     def status(self) -> int:
@@ -45,12 +51,35 @@ class EndSignal:
             yield
         finally:
             self._raises = False
+            if self._again is not None:
+                self._again.cancel()
 
     def handle(self, number: int, _frame: object) -> None:
         """The handler of the signals."""
         self.number = self.number or number
         if self._raises:
             raise KeyboardInterrupt
+
+    def raise_ignored(self, ignored: sys.UnraisableHookArgs) -> None:
+        """The hook for exceptions that Python ignores: a `KeyboardInterrupt` is raised again, a little later.
+
+        Python ignores what is raised in a callback from a native library, such as Numba's compiler, and in a
+        finaliser: the command would go on although it was asked to end.
+        """
+        if not (self.number and issubclass(ignored.exc_type, KeyboardInterrupt)):
+            self._hook(ignored)
+        elif self._raises:
+            self._again = threading.Timer(AGAIN, _interrupt, (self.number,))
+            self._again.daemon = True
+            self._again.start()
+
+
+def _interrupt(number: int) -> None:
+    """Send the signal to the main thread, where it ends a wait as well."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident, number)
+    else:  # Windows
+        _thread.interrupt_main(number)
 
 
 @contextmanager
@@ -64,6 +93,7 @@ def ended_by_signal() -> Iterator[EndSignal]:
     ending, signals = EndSignal(), (signal.SIGINT, signal.SIGTERM)
     can_wait = hasattr(signal, "pthread_sigmask")
     previous = {}
+    previous_hook, sys.unraisablehook = sys.unraisablehook, ending.raise_ignored
     # Signal handlers can only be set in the main thread.
     with suppress(ValueError):
         for number in signals:
@@ -72,6 +102,7 @@ def ended_by_signal() -> Iterator[EndSignal]:
     try:
         yield ending
     finally:
+        sys.unraisablehook = previous_hook
         if blocked is not None:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for number, handler in previous.items():
