@@ -154,6 +154,20 @@ def test_a_signal_in_a_callback_of_a_library_ends_the_command(monkeypatch, capfd
     assert time.monotonic() - times[0] < 20
 
 
+def test_finalisers_of_objects_that_a_signal_left_half_made_are_silent(monkeypatch, capfd):
+    class HalfMade:
+        def __init__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+            self.closed = False
+
+        def __del__(self) -> None:
+            assert not self.closed
+
+    monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
+    assert main(command(monkeypatch, lambda _: HalfMade())) == 143
+    assert capfd.readouterr().err == "stopped\n"
+
+
 def test_other_exceptions_in_a_callback_are_shown(monkeypatch, capfd):
     @ctypes.CFUNCTYPE(None)
     def callback() -> None:

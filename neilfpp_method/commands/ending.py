@@ -64,11 +64,12 @@ class EndSignal:
         """The hook for exceptions that Python ignores: a `KeyboardInterrupt` is raised again, a little later.
 
         Python ignores what is raised in a callback from a native library, such as Numba's compiler, and in a
-        finaliser: the command would go on although it was asked to end.
+        finaliser: the command would go on although it was asked to end. Other exceptions after the signal
+        come from objects that it left half made, and are not shown.
         """
-        if not (self.number and issubclass(ignored.exc_type, KeyboardInterrupt)):
+        if not self.number:
             self._hook(ignored)
-        elif self._raises:
+        elif self._raises and issubclass(ignored.exc_type, KeyboardInterrupt):
             self._again = threading.Timer(AGAIN, _interrupt, (self.number,))
             self._again.daemon = True
             self._again.start()
