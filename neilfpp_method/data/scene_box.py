@@ -4,12 +4,13 @@ The scene frame has the object in the unit sphere; the box gives its centre and 
 The most reliable source is used: points on the surface, then the masks, whose visual hull contains the
 object, then the cameras. Points without masks may extend far beyond the object, to walls and trees. A box
 around all of them would contain the cameras as well, and every view could then be explained by density close
-to its own camera. In this case the box is placed around the point that the cameras look at, and ends well
-before them.
+to its own camera. In this case, or if the points extend far to one side, the box is placed around the point
+that the cameras look at, and ends well before them.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,6 +40,10 @@ REFINEMENTS = 3
 SAME_PLACE = 1e-10
 """Extent of the camera centres, relative to their largest coordinate, below which they are one point that was
 computed with rounding errors."""
+
+OFF_CENTER = 0.5
+"""Distance of the middle of a box of points from the focus of the cameras, relative to the scale of the box,
+above which the box is discarded: a few points far behind the object have moved it to one side."""
 
 REACH = 0.55
 """Ratio of the radius of a box around the focus of the cameras to their median distance from it. Half of the
@@ -75,12 +80,17 @@ def find_box(views: Sequence[View], points: Float64[np.ndarray, "P 3"] | None = 
         box = box_of_points(points)
         # Points inside the masks belong to the object, so their box is not too large.
         focus = None if outlines else box_of_focus(views)
-        return (
-            SceneBox(box, "points") if focus is None or box.scale <= focus.scale else SceneBox(focus, "focus")
-        )
+        if focus is None or (box.scale <= focus.scale and _is_central(box, focus)):
+            return SceneBox(box, "points")
+        return SceneBox(focus, "focus")
     if outlines:
         return SceneBox(_carve(outlines, box_of_cameras(views, fill=2.0)), "masks")
     return SceneBox(box_of_cameras(views), "cameras")
+
+
+def _is_central(box: Normalization, focus: Normalization) -> bool:
+    """Whether the cameras look at the middle of the box, at most `OFF_CENTER` of its scale away."""
+    return math.dist(box.center, focus.center) <= OFF_CENTER * box.scale
 
 
 def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalization:

@@ -13,7 +13,7 @@ import torch
 from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.files.images import read_image, write_png
-from neilfpp_method.data.scene_box import box_of_cameras, box_of_points, find_box
+from neilfpp_method.data.scene_box import REACH, box_of_cameras, box_of_points, find_box
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTER, DISTANCE, RADIUS, camera_pose, make_capture
@@ -73,6 +73,17 @@ def test_the_most_reliable_source_is_used(tmp_path: Path) -> None:
     assert find_box(masked).source == "masks"
     assert find_box(masked, sphere_points()).source == "points"
     assert find_box(plain, sphere_points(5)).source == "cameras"
+
+
+def test_a_box_beside_the_focus_of_the_cameras_is_not_used(tmp_path: Path) -> None:
+    """A twentieth of the points lies on one side, behind the object; the box is still not too large."""
+    plain, points = views(tmp_path), CENTER + 0.4 * (sphere_points() - CENTER)
+    behind = points[:100] + np.array([2 * RADIUS, 0, 0])
+    lopsided = np.concatenate([points, behind])
+    assert box_of_points(lopsided).scale < REACH * DISTANCE
+    box = find_box(plain, lopsided)
+    assert box.source == "focus"
+    assert np.allclose(box.normalization.center, CENTER, atol=0.1 * RADIUS)
 
 
 def test_points_outside_the_masks_are_ignored(tmp_path: Path) -> None:
