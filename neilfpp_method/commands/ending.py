@@ -20,7 +20,7 @@ AGAIN = 0.05
 
 
 class EndSignal:
-    """The signal that asked the process to end; `number` is 0 if there was none.
+    """The signal that asked the process to end; `number` is 0 if there was none, `hook` the hook of before.
 
     The first one counts. The signal is recorded in addition to the exception that it raises, because an
     extension module that is being loaded may turn the exception into one of its own.
@@ -29,7 +29,7 @@ class EndSignal:
     def __init__(self) -> None:
         self.number = 0
         self._raises = False
-        self._hook = sys.unraisablehook
+        self.hook = sys.unraisablehook
         self._again: threading.Timer | None = None
 
     @property
@@ -68,7 +68,7 @@ class EndSignal:
         come from objects that it left half made, and are not shown.
         """
         if not self.number:
-            self._hook(ignored)
+            self.hook(ignored)
         elif self._raises and issubclass(ignored.exc_type, KeyboardInterrupt):
             self._again = threading.Timer(AGAIN, _interrupt, (self.number,))
             self._again.daemon = True
@@ -94,7 +94,7 @@ def ended_by_signal() -> Iterator[EndSignal]:
     ending, signals = EndSignal(), (signal.SIGINT, signal.SIGTERM)
     can_wait = hasattr(signal, "pthread_sigmask")
     previous = {}
-    previous_hook, sys.unraisablehook = sys.unraisablehook, ending.raise_ignored
+    sys.unraisablehook = ending.raise_ignored
     # Signal handlers can only be set in the main thread.
     with suppress(ValueError):
         for number in signals:
@@ -103,7 +103,7 @@ def ended_by_signal() -> Iterator[EndSignal]:
     try:
         yield ending
     finally:
-        sys.unraisablehook = previous_hook
+        sys.unraisablehook = ending.hook
         if blocked is not None:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for number, handler in previous.items():
