@@ -79,9 +79,11 @@ class LightSolver(Protocol):
     ) -> Evidence | None:
         """Look for lamps in addition to an initial map that has been set; if none is found, keep that map.
 
-        The first `solve` is then due one interval of fits later, so that surfaces first learn under this
-        light. If lamps are rejected here, later fits do not look for them, which halves their time: their
-        points are fewer, and surfaces that have learned with a light confirm it.
+        Without lamps, the first `solve` is due one interval of fits later, so that surfaces first learn under
+        this light; later fits do not look for lamps, which halves their time: their points are fewer, and
+        surfaces that have learned with a light confirm it. Lamps found here are only the decision that there
+        are some: at so few points they are misplaced. The first `solve` is then due at once, and looks for
+        them again.
 
         Args:
             observed: surface points.
@@ -186,16 +188,17 @@ class MapSolver(nn.Module):
     def seeks_start(self) -> bool:
         """See `LightSolver.seeks_start`."""
         fits_map = self.config.map is None and not self.light.light.even
-        return fits_map and self.memory.age is None
+        has_started = self.memory.age is not None or bool(self.log_mean_base_color.isfinite())
+        return fits_map and not has_started
 
     @torch.no_grad()
     def start(
         self, observed: Observed, material: Material, scene: SceneTracer | None, judge: JudgeLamps
     ) -> Evidence | None:
         """See `LightSolver.start`."""
-        self.memory.wait()
         self.log_mean_base_color.copy_(material.base_color.log().mean())
         if self.config.kind == "distant":
+            self.memory.wait()
             return None
         environment, lamps = self.light.light, self.light.lamps
         # What cameras saw of the light is stored for the texels of the full map.
@@ -209,6 +212,8 @@ class MapSolver(nn.Module):
                 measured = in_views
         if lamps.count:
             environment.resample(trial.light.log_radiance)
+        else:
+            self.memory.wait()
         self.lamps_rejected.fill_(not lamps.count)
         return measured
 
@@ -222,7 +227,15 @@ class MapSolver(nn.Module):
         if not self.due:
             return None
         first, observed = self.memory.age is None, self.memory.recall()
+        if first and self.config.map is None:
+            self._forget_light()
         return self._solve(self.light, observed, brdf(observed.position), scene, first)
+
+    def _forget_light(self) -> None:
+        """Start a fit from an even map of the same mean and without lamps."""
+        log_radiance = self.light.light.log_radiance
+        log_radiance.copy_(log_radiance.mean((1, 2), keepdim=True).expand_as(log_radiance))
+        self.light.lamps.switch_off()
 
     def _log_scale(self, material: Material) -> float:
         """Logarithm of the factor that gives base colours the mean of the initial light."""
