@@ -81,9 +81,9 @@ class LightSolver(Protocol):
 
         Without lamps, the first `solve` is due one interval of fits later, so that surfaces first learn under
         this light; later fits do not look for lamps, which halves their time: their points are fewer, and
-        surfaces that have learned with a light confirm it. Lamps found here are only the decision that there
-        are some: at so few points they are misplaced. The first `solve` is then due at once, and looks for
-        them again.
+        surfaces that have learned with a light confirm it. If lamps are found here, their places are not
+        kept, because so few points misplace them. The first `solve` is then due at once, and looks for the
+        lamps again.
 
         Args:
             observed: surface points.
