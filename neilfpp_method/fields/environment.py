@@ -68,7 +68,13 @@ class EnvironmentLight(nn.Module):
     def set_even(self, even: bool) -> None:
         """Make the light even, with the mean radiance of the map over solid angle, or a map again."""
         self.even = even
-        if even and (self.log_radiance != self.log_radiance[:, :1, :1]).any():
+        if even:
+            self.average()
+
+    @torch.no_grad()
+    def average(self) -> None:
+        """Set all texels to the mean radiance of the map over solid angle."""
+        if (self.log_radiance != self.log_radiance[:, :1, :1]).any():
             share = self._texel_solid_angles() / (4 * math.pi)
             self.log_radiance.copy_((self.log_radiance.exp().flatten(1) @ share).log()[:, None, None])
 

@@ -228,14 +228,10 @@ class MapSolver(nn.Module):
             return None
         first, observed = self.memory.age is None, self.memory.recall()
         if first and self.config.map is None:
-            self._forget_light()
+            # A map that was fitted without lamps has blurred lamps in it, and keeps them.
+            self.light.light.average()
+            self.light.lamps.switch_off()
         return self._solve(self.light, observed, brdf(observed.position), scene, first)
-
-    def _forget_light(self) -> None:
-        """Start a fit from an even map of the same mean and without lamps."""
-        log_radiance = self.light.light.log_radiance
-        log_radiance.copy_(log_radiance.mean((1, 2), keepdim=True).expand_as(log_radiance))
-        self.light.lamps.switch_off()
 
     def _log_scale(self, material: Material) -> float:
         """Logarithm of the factor that gives base colours the mean of the initial light."""

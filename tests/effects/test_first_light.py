@@ -13,6 +13,7 @@ from neilfpp_method.effects.evidence.metals import metals_evidence
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light, start_with
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.places.data import ROWS
+from neilfpp_method.effects.places.fit import Permitted, fit_places
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.lighting.solver import NothingToSolve
@@ -54,6 +55,16 @@ def test_scale_and_map_are_found_together():
     assert f"{COUNT} places" in found.summary()
     assert len(found.observed) == len(found.material.roughness) <= len(data.places.place)
     assert (found.material.base_color == found.mean.base_color).all()
+
+
+def test_places_without_pixels_do_not_change_the_scale():
+    """When they counted, the mean of the others was 0.99 in place of 0.2."""
+    lobe, grey = LOBES["ggx"], torch.full((120, 3), 0.5)
+    data = data_of(ball(grey, grey[:, :1], 0 * grey[:, :1], lobe), lobe)
+    kept = data.where(torch.nonzero(data.places.place % 3 == 0)[:, 0])
+    fit = fit_places(kept, Permitted(metals=False, mean_base_color=0.2), rounds=3)
+    mean = fit.base_color[kept.places.place.unique()].log().mean().exp().item()
+    assert mean == pytest.approx(0.2, rel=0.1)
 
 
 def test_held_back_views_identify_the_lobe_of_the_images():

@@ -102,8 +102,8 @@ class Permitted:
 
     Attributes:
         metals: whether metallic may be greater than 0.
-        mean_base_color: value of the geometric mean of base colour over places and channels; None if it is
-            free.
+        mean_base_color: value of the geometric mean of base colour over channels and the places that have
+            pixels; None if it is free.
         form: projection of log radiance onto the permitted maps.
     """
 
@@ -170,6 +170,8 @@ def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
 def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: int) -> PlaceFit:
     """Improve the light and the base colours by descent, with fixed roughness and metallic."""
     place = data.places.place
+    # The base colour of a place without pixels is arbitrary.
+    shown = place.unique()
     selected = _at_roughness(data.transport, fit.roughness[place])
     material = fit.material(place)
     mean_transport = selected.sources[0].mean(0)
@@ -190,7 +192,7 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
             loss = loss + white_balance(contribution, contribution.sum(0), data.response)
             loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
             if permitted.mean_base_color is not None:
-                off = _log_mean(base_color) - math.log(permitted.mean_base_color)
+                off = _log_mean(base_color[shown]) - math.log(permitted.mean_base_color)
                 loss = loss + SCALE_WEIGHT * off.square()
             optimizer.zero_grad()
             loss.backward()

@@ -69,14 +69,19 @@ class Places:
         return Places(self.count, self.place[rows], self.view[rows], self.observed[rows])
 
     def with_at_least(self, min_pixels: int) -> Places:
-        """The same places, without the pixels of places that have fewer than `min_pixels`."""
+        """The places that have at least `min_pixels` pixels, numbered from 0."""
         pixels = torch.bincount(self.place, minlength=self.count)
-        return self.where(torch.nonzero(pixels[self.place] >= min_pixels)[:, 0])
+        return self.where(torch.nonzero(pixels[self.place] >= min_pixels)[:, 0]).only_shown()
 
     def first(self, max_pixels: int) -> Places:
-        """The same places, with the pixels of the first ones that have at most `max_pixels` together."""
+        """The first places that have at most `max_pixels` pixels together, numbered from 0."""
         total = torch.bincount(self.place, minlength=self.count).cumsum(0)
-        return self.where(torch.nonzero(total[self.place] <= max_pixels)[:, 0])
+        return self.where(torch.nonzero(total[self.place] <= max_pixels)[:, 0]).only_shown()
+
+    def only_shown(self) -> Places:
+        """The places that have pixels, numbered from 0."""
+        numbers, place = self.place.unique(return_inverse=True)
+        return Places(len(numbers), place, self.view, self.observed)
 
     def mean(self, values: Float[Tensor, "N ..."]) -> Float[Tensor, "P ..."]:
         """Mean of values over the pixels of each place; 0 for a place without pixels."""

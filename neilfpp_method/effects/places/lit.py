@@ -96,8 +96,7 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
         places: places with their pixels in the training views, in linear radiance. Those without pixels are
             left out of the result.
     """
-    numbers, place = places.place.unique(return_inverse=True)
-    places = Places(len(numbers), place, places.view, places.observed)
+    places = places.only_shown()
     shared = places.shared_points()
     light = LightModel(model.light, model.lamps)
     draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]

@@ -21,6 +21,18 @@ def test_means_are_computed_per_place():
     assert places.where(torch.tensor([1])).mean(values[1:2]).tolist() == [3.0, 0.0, 0.0]
 
 
+def test_selected_places_all_have_pixels():
+    place = torch.tensor([0, 0, 0, 2, 4, 4])
+    rows = torch.arange(6.0)[:, None].expand(-1, 3)
+    places = Places(5, place, torch.arange(6), Observed(*[rows] * 4))
+    two = places.with_at_least(2)
+    assert (two.count, two.place.tolist()) == (2, [0, 0, 0, 1, 1])
+    assert two.observed.pixel[:, 0].tolist() == [0, 1, 2, 4, 5]
+    first = places.first(4)
+    assert (first.count, first.place.tolist()) == (2, [0, 0, 0, 1])
+    assert places.only_shown().count == places.shown_count == 3
+
+
 def test_rays_are_traced_once_per_place():
     one = torch.ones(40, 1)
     places = ball(0.5 * one.expand(-1, 3), 0.28 * one, 0 * one, LOBE)
