@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.evidence.lamps import LampTrial
-from neilfpp_method.effects.light_scale import FIRST_SCALE, SCALES, lowest_scale, scale_of_metals
+from neilfpp_method.effects.light_scale import FIRST_SCALE, SCALES, lowest_scale, scale_of_metals, with_prior
 from neilfpp_method.effects.places.data import PlaceData
 from neilfpp_method.effects.places.fit import (
     FIRST_STEPS,
@@ -117,7 +117,9 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
         fits[scale] = fit_places(split.known, Permitted(metals, scale), start, CARRIED_ROUNDS)
     errors = {scale: place_errors(fit, split.held_back) for scale, fit in fits.items()}
     mean_errors = {scale: error.mean().item() for scale, error in errors.items()}
-    scale = scale_of_metals(fits, errors, split.held_back.places) or lowest_scale(mean_errors)
+    scale = scale_of_metals(fits, errors, split.held_back.places)
+    if scale is None:
+        scale = lowest_scale(with_prior(mean_errors, data.response))
     start = _rescaled(fits, scale)
 
     def fit_on(changed: PlaceData) -> PlaceFit:

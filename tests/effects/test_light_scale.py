@@ -7,7 +7,13 @@ import math
 import pytest
 import torch
 
-from neilfpp_method.effects.light_scale import SCALES, lowest_scale, scale_of_metals, unbounded_scale
+from neilfpp_method.effects.light_scale import (
+    SCALES,
+    lowest_scale,
+    scale_of_metals,
+    unbounded_scale,
+    with_prior,
+)
 from neilfpp_method.effects.places.data import ROWS
 from neilfpp_method.effects.places.fit import PlaceFit
 from neilfpp_method.effects.places.gathering import Places
@@ -26,6 +32,14 @@ def test_lowest_is_the_minimum_of_the_parabola_over_the_logarithm():
     assert lowest_scale(errors(0.27)) == pytest.approx(0.27)
     assert lowest_scale(errors(0.05)) == 0.1  # at an end: no further
     assert lowest_scale(errors(0.9)) == 0.7
+
+
+def test_photographs_need_a_clear_minimum_for_an_unusual_scale():
+    flat = dict(zip(sorted(SCALES), (0.199, 0.206, 0.209, 0.209, 0.210, 0.215), strict=True))
+    assert lowest_scale(with_prior(flat, "linear")) == 0.1
+    assert lowest_scale(with_prior(flat, "srgb")) == pytest.approx(0.28, abs=0.05)
+    clear = {scale: 0.13 + 0.05 * math.log(scale / 0.6) ** 2 for scale in SCALES}
+    assert lowest_scale(with_prior(clear, "srgb")) == pytest.approx(0.52, abs=0.04)
 
 
 def fitted(scale: float, metal_share: float) -> PlaceFit:

@@ -33,7 +33,7 @@ def test_a_missing_or_blurred_surface_is_a_finding(opaque, sharp, found):
     assert cases(surface_findings(SurfaceMeasurement(100, opaque, sharp, None), 7)) == found
 
 
-@pytest.mark.parametrize(("share", "found"), [(None, []), (0.2, []), (0.8, ["material_at_bounds"])])
+@pytest.mark.parametrize(("share", "found"), [(None, []), (0.1, []), (0.4, ["material_at_bounds"])])
 def test_a_material_at_its_bounds_is_a_finding(share, found):
     assert cases(material_findings(SurfaceMeasurement(100, 1.0, 1.0, share), 7)) == found
 
