@@ -44,6 +44,8 @@ TICK = 0.5
 
 LABEL_SPACING = 34
 """Smallest distance between two labels of images below the chart, in pixels."""
+LABEL_LETTERS = 8
+"""Largest number of letters of such a label."""
 
 
 def write_picture(
@@ -124,8 +126,13 @@ def draw_fit(placed: Sequence[Placement], width: int) -> UInt8[np.ndarray, "H W 
         share, color = (1.0, MISSING) if placement.error is None else (placement.error / top, TRAIN)
         draw.rectangle([left + 0.15 * step, base - height * share, left + 0.85 * step, base], fill=color)
         if i % label_every == 0:
-            write(draw, (int(left), base + 6), placement.name[-8:], LABEL)
+            write(draw, (int(left), base + 6), _short(placement.name), LABEL)
     return np.asarray(sheet)
+
+
+def _short(name: str) -> str:
+    """The end of a name; the ends of the names of photographs differ."""
+    return name if len(name) <= LABEL_LETTERS else "…" + name[1 - LABEL_LETTERS :]
 
 
 class _Projection:
