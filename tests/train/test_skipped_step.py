@@ -20,7 +20,7 @@ from neilfpp_method.train.rerun import rerun_step, rerun_summary
 from neilfpp_method.train.run import CaptureSource, create_run
 from neilfpp_method.train.skipped import FOLDER, MAX_KEPT, load_step
 from neilfpp_method.train.training import Training
-from tests.hard_cases.hostile.stored_readers import make_step
+from tests.hard_cases.hostile.readers.stored import make_step
 from tests.train.small_runs import small_config, small_training
 
 

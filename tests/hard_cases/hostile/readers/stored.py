@@ -16,10 +16,10 @@ from neilfpp_method.train.skipped import FOLDER, FORMAT, load_step
 from tests.data.make_capture import make_capture
 from tests.hard_cases.hostile.readers.reader import Reader
 
-__all__ = ["STORED"]
+__all__ = ["STORED", "make_step"]
 
 
-def _make_step(folder: Path) -> list[Path]:
+def make_step(folder: Path) -> list[Path]:
     """A skipped step."""
     rays = {name: torch.rand(4, 3) for name in ("origins", "directions", "color")}
     numbers = {name: torch.rand(4) for name in ("mask", "mask_known", "image_gradient")}
@@ -72,5 +72,5 @@ def _capture(folder: Path) -> Capture:
 
 STORED: Mapping[str, Reader] = {
     "pixels in a run folder (NPY, JSON)": Reader(_make_pixels, _read_pixels, 0.2),
-    "skipped step": Reader(_make_step, _read_step),
+    "skipped step": Reader(make_step, _read_step),
 }
