@@ -37,7 +37,8 @@ USUAL_SCALE = 0.3
 PRIOR_WEIGHT = 0.0125
 """Relative error that counts as much as a scale that is off by a factor of e from the usual one, in images
 with display values. Photographs of a pale stone head had errors of 0.199 at a scale of 0.1, of 0.209 at 0.22
-and 0.33, and of 0.210 at 0.5. Renderings in 8 bits have minima as deep as this at the true scale.
+and 0.33, and of 0.210 at 0.5. In 8-bit renderings of four scenes, the error at a third of the true scale was
+0.004 to 0.015 above the lowest.
 """
 METAL_REFLECTANCE = 0.7
 """Typical base colour of a metal, mean of the channels: iron has 0.57, gold 0.71, silver 0.95."""

@@ -228,7 +228,7 @@ class MapSolver(nn.Module):
             return None
         first, observed = self.memory.age is None, self.memory.recall()
         if first and self.config.map is None:
-            # A map that was fitted without lamps has blurred lamps in it, and keeps them.
+            # A fit that starts from the map and the lamps of `start` keeps the errors of their few points.
             self.light.light.average()
             self.light.lamps.switch_off()
         return self._solve(self.light, observed, brdf(observed.position), scene, first)

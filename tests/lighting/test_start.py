@@ -20,7 +20,7 @@ HARMFUL = Evidence(-0.1, 0.01, 400)
 
 
 @pytest.mark.parametrize("in_views", [HELPFUL, HARMFUL], ids=["lamps", "no lamps"])
-def test_only_a_light_without_lamps_outlives_the_start(in_views, monkeypatch):
+def test_the_first_fit_is_even_after_lamps_and_keeps_a_map_without_them(in_views, monkeypatch):
     counts: list[int] = []
     maps: list[torch.Tensor] = []
 
@@ -37,8 +37,8 @@ def test_only_a_light_without_lamps_outlives_the_start(in_views, monkeypatch):
     model = sphere_model(dataclasses.replace(fast, light=dataclasses.replace(fast.light, fit=fit)))
     rows = torch.linspace(-1, 1, model.light.log_radiance.shape[1])
     model.light.log_radiance.copy_(rows[:, None].expand_as(model.light.log_radiance))
-    seen, made_of = points(400), material(400)
-    observed = Observed(seen.position, seen.normal, seen.wo, torch.ones(400, 3))
+    surface, made_of = points(400), material(400)
+    observed = Observed(surface.position, surface.normal, surface.wo, torch.ones(400, 3))
     solver = model.light_solver()
     assert solver.seeks_start
     measured = solver.start(observed, made_of, None, lambda *_: in_views)

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 import torch
 
-from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.errors import UserError
 from neilfpp_method.schedule import Stage
 from neilfpp_method.train.skipped import FOLDER, FORMAT, load_step
 from tests.data.make_capture import make_capture
-from tests.hard_cases.hostile.readers.reader import Reader
+from tests.hard_cases.hostile.readers.reader import Reader, capture_beside
 
 __all__ = ["STORED", "make_step"]
 
@@ -59,15 +57,10 @@ def _read_pixels(folder: Path, damaged: Path) -> None:
 
 
 def _load(folder: Path) -> None:
-    capture = _capture(folder / "capture")
+    capture = capture_beside(folder / "capture")
     pixels = PixelDataset(capture, capture.views, folder=folder / "cache")
     for i, view in enumerate(capture.views):
         assert pixels.view(i).color.shape == (view.camera.width * view.camera.height, 3)
-
-
-@cache
-def _capture(folder: Path) -> Capture:
-    return load_capture(folder)
 
 
 STORED: Mapping[str, Reader] = {

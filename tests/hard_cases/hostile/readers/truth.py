@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from scipy.io import savemat
 
-from neilfpp_method.data.capture import Capture, load_capture
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.evaluate.published.dtu import read_scan
 from neilfpp_method.evaluate.published.truth_files import read_array
 from tests.data.make_capture import make_capture
-from tests.hard_cases.hostile.readers.reader import Reader
+from tests.hard_cases.hostile.readers.reader import Reader, capture_beside
 
 __all__ = ["TRUTH"]
 
@@ -36,7 +34,7 @@ def _truth(folder: Path) -> list[Path]:
 
 
 def _read_truth(folder: Path, damaged: Path) -> None:
-    field = Truth(_capture(folder)).light_field()
+    field = Truth(capture_beside(folder)).light_field()
     assert field is not None
     assert field.position.shape == (len(field.position), 3)
     assert field.position.isfinite().all()
@@ -72,17 +70,11 @@ def _make_scan(folder: Path) -> list[Path]:
 
 
 def _read_scanned(folder: Path, damaged: Path) -> None:
-    scan = read_scan(_capture(folder / "scan24"))
+    scan = read_scan(capture_beside(folder / "scan24"))
     assert scan.mask.ndim == 3
     assert scan.cell > 0
     for values in (scan.low, scan.high, scan.plane, scan.points):
         assert np.isfinite(values).all()
-
-
-@cache
-def _capture(folder: Path) -> Capture:
-    """A capture beside the damaged file."""
-    return load_capture(folder)
 
 
 TRUTH: Mapping[str, Reader] = {
