@@ -22,10 +22,12 @@ from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_firs
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.places.data import PlaceData, place_transport
 from neilfpp_method.effects.places.gathering import Places, gather_places
-from neilfpp_method.effects.places.lit import light_up
+from neilfpp_method.effects.places.lit import LitPlaces, light_up
+from neilfpp_method.effects.places.rescaling import correct_scale
 from neilfpp_method.effects.places.search import search_materials, teach
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
+from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import has_material
 from neilfpp_method.settings.facts import SceneFacts
@@ -37,6 +39,7 @@ __all__ = [
     "MIN_TRAIN_VIEWS",
     "POSE_STEPS",
     "SURFACE_PIXELS",
+    "Improved",
     "LightReview",
     "improve_material",
     "light_places",
@@ -177,25 +180,47 @@ def light_places(model: NeilfModel, pixels: PixelDataset, max_pixels: int = MAX_
         return places.with_at_least(MIN_VIEWS).first(max_pixels)
 
 
-def improve_material(model: NeilfModel, places: Places) -> str | None:
-    """Search for paint taken for metal, and train the BRDF field on it (`effects.places.search`).
+@dataclass(frozen=True)
+class Improved:
+    """The result of `improve_material`.
+
+    Attributes:
+        lit: the places under the light afterwards.
+        summaries: lines for the console.
+    """
+
+    lit: LitPlaces
+    summaries: list[str]
+
+
+def improve_material(model: NeilfModel, solver: LightSolver, places: Places) -> Improved | None:
+    """Correct the scale of a half-trained model, and replace metal by paint where paint is better.
 
     Args:
-        model: its light is an environment map; see `places.search.is_search_due`.
+        model: its light is an environment map; see `places.search.is_comparison_due`.
+        solver: keeps the scale in later fits of the light.
         places: places in the training views, with linear radiance.
 
     Returns:
-        One line for the console; None if there are fewer than `MIN_PLACES` places.
+        None if there are fewer than `MIN_PLACES` places.
     """
     if places.shown_count < MIN_PLACES:
         return None
-    searched = search_materials(model, places)
-    if searched.share > 0:
-        teach(model.brdf, searched)
-    return f"material search: {searched.share:.0%} of the places are paint that was taken for metal"
+    lit, summaries = light_up(model, places), []
+    rescaled = correct_scale(model, solver, lit)
+    if rescaled is not None:
+        lit = rescaled.lit
+        summaries.append(rescaled.summary())
+    if model.brdf.metals:
+        searched = search_materials(model.brdf, lit)
+        if searched.share > 0:
+            teach(model.brdf, searched)
+        paint = f"{searched.share:.0%} of the places are paint that was taken for metal"
+        summaries.append(f"material search: {paint}")
+    return Improved(lit, summaries)
 
 
-def review_metals(plan: Plan, model: NeilfModel, places: Places, step: int) -> list[Decision]:
+def review_metals(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> list[Decision]:
     """Decide again on metals that are off, under the light of a half-trained model.
 
     If they are on afterwards, the model uses them, and its BRDF field is trained on the metal that was found.
@@ -203,15 +228,14 @@ def review_metals(plan: Plan, model: NeilfModel, places: Places, step: int) -> l
     Args:
         plan: the plan to which the decision is added.
         model: its light is an environment map; see `places.search.is_comparison_due`.
-        places: places in the training views, with linear radiance.
+        lit: places under this light.
         step: number of steps trained so far.
 
     Returns:
-        The new decision; empty if metals are on, decided otherwise, or shown by too few places.
+        The new decision; empty if metals are on or decided otherwise.
     """
-    if model.brdf.metals or not plan.is_open("metals") or places.shown_count < MIN_PLACES:
+    if model.brdf.metals or not plan.is_open("metals"):
         return []
-    lit = light_up(model, places)
     decision = plan.decide("metals", metals_evidence_in(lit, model.facts.response), step)
     if decision.on:
         model.use(plan.config)

@@ -84,6 +84,16 @@ class BrdfField(nn.Module):
         values = torch.cat((material.base_color, material.roughness, material.metallic), -1)[0]
         self.mlp.layers[-1].bias.copy_(torch.atanh(2 * values.clamp(*START_RANGE) - 1))
 
+    @torch.no_grad()
+    def brighten(self, base_color: float, factor: float) -> None:
+        """Shift the biases so that this base colour becomes brighter by a factor.
+
+        Darker ones are multiplied by about the same factor. Brighter ones approach 1.
+        """
+        brighter = min(factor * base_color, START_RANGE[1])
+        shift = math.atanh(2 * brighter - 1) - math.atanh(2 * base_color - 1)
+        self.mlp.layers[-1].bias[:3] += shift
+
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
         if not self.varying_roughness:

@@ -23,7 +23,7 @@ from neilfpp_method.lighting.transport import Transport, brdf_kernel, spans
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Observed, SceneTracer
 
-__all__ = ["SharedPoints", "lamp_layers", "layers_at", "light_layers", "texel_layers"]
+__all__ = ["LightLayers", "SharedPoints", "lamp_layers", "layers_at", "light_layers", "texel_layers"]
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,19 @@ class SharedPoints:
     normal: Float[Tensor, "P 3"]
     observed: Observed
     point: Int[Tensor, " N"]
+
+
+@dataclass(frozen=True)
+class LightLayers:
+    """The layers of outgoing radiance at N pixels.
+
+    Attributes:
+        light: the part that the map and the lamps cause.
+        scene: the part that the radiance of other surfaces causes.
+    """
+
+    light: Float[Tensor, "K N 3"]
+    scene: Float[Tensor, "K N 3"]
 
 
 @torch.no_grad()
@@ -77,19 +90,23 @@ def light_layers(
     roughnesses: Sequence[float],
     lobe: Lobe,
     scene: SceneTracer | None,
-) -> Float[Tensor, "K N 3"]:
+) -> LightLayers:
     """The layers of outgoing radiance that a known map, known lamps and the scene cause.
 
     No transport matrix is stored, so that the map may have any size. Arguments as in `texel_layers`.
     """
     environment, lamps = light.light, light.lamps
     radiance = environment.log_radiance.exp().flatten(1).t()
-    parts = _texel_layers(environment, shared, roughnesses, lobe, scene)
-    total = torch.cat([part.sources.float() @ radiance + part.scene for part in parts], 1)
+    spans_of_pixels = [
+        LightLayers(part.sources.float() @ radiance, part.scene)
+        for part in _texel_layers(environment, shared, roughnesses, lobe, scene)
+    ]
+    from_light = torch.cat([layers.light for layers in spans_of_pixels], 1)
+    from_scene = torch.cat([layers.scene for layers in spans_of_pixels], 1)
     if lamps.count:
         sight = in_sight(lamps.lit_places, lamps.radius, shared.position, scene)[shared.point]
-        total += lamp_layers(lamps, sight, shared.observed, roughnesses, lobe)
-    return total
+        from_light += lamp_layers(lamps, sight, shared.observed, roughnesses, lobe)
+    return LightLayers(from_light, from_scene)
 
 
 def lamp_layers(

@@ -74,6 +74,15 @@ class LightSolver(Protocol):
         """Whether the solver fits a map and there has been neither a fit nor a start."""
         ...
 
+    @property
+    def scale_is_free(self) -> bool:
+        """Whether the scale between light and base colour is that of an initial light, which may be off."""
+        ...
+
+    def rescale(self, factor: float) -> None:
+        """Divide the light by a factor; the base colours of later fits are brighter by it."""
+        ...
+
     def start(
         self, observed: Observed, material: Material, scene: SceneTracer | None, judge: JudgeLamps
     ) -> Evidence | None:
@@ -116,7 +125,10 @@ class LightSolver(Protocol):
 class NothingToSolve(nn.Module):
     """The solver of a light that is learned by gradient descent, or completely known: it does nothing."""
 
-    due, points, seeks_start = False, 0, False
+    due, points, seeks_start, scale_is_free = False, 0, False, False
+
+    def rescale(self, factor: float) -> None:
+        """Do nothing."""
 
     def start(
         self, observed: Observed, material: Material, scene: SceneTracer | None, judge: JudgeLamps
@@ -190,6 +202,20 @@ class MapSolver(nn.Module):
         fits_map = self.config.map is None and not self.light.light.even
         has_started = self.memory.age is not None or bool(self.log_mean_base_color.isfinite())
         return fits_map and not has_started
+
+    @property
+    def scale_is_free(self) -> bool:
+        """See `LightSolver.scale_is_free`."""
+        fixed_by_sky = self.sky is not None and not self.light.light.even and self.sky.known().fixes_scale
+        is_set = bool(self.log_mean_base_color.isfinite())
+        return is_set and self.config.map is None and not fixed_by_sky
+
+    @torch.no_grad()
+    def rescale(self, factor: float) -> None:
+        """See `LightSolver.rescale`."""
+        self.light.light.log_radiance.sub_(math.log(factor))
+        self.light.lamps.intensity.div_(factor)
+        self.log_mean_base_color.add_(math.log(factor))
 
     @torch.no_grad()
     def start(

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.places.search import is_search_due
+from neilfpp_method.effects.places.search import is_comparison_due
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import improve_material, light_places, review_light
@@ -161,7 +161,7 @@ class Steps:
         if self.light_solver.due:
             self.watch.after_fit(self.light_solver.points, step)
         self._evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self._evidence
-        self._search_material(step)
+        self._improve_half_trained(step)
         self._computed = None
 
     def check_and_save(self, trainer: Trainer, step: int) -> None:
@@ -190,14 +190,15 @@ class Steps:
         """Restore the process-wide settings after training."""
         self._while_training.close()
 
-    def _search_material(self, step: int) -> None:
-        """Search for paint taken for metal when this is due."""
+    def _improve_half_trained(self, step: int) -> None:
+        """When it is due, correct the scale of light and material, and replace metal by better paint."""
         position = stage_at(step, self.settings.train)
-        if not is_search_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
+        if not is_comparison_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
             return
         seed_stream(self.settings.train.seed, Stream.SEARCH, step + 1)
-        summary = improve_material(self.neilf, light_places(self.neilf, self._pixels_on_device()))
-        if summary is not None:
+        places = light_places(self.neilf, self._pixels_on_device())
+        improved = improve_material(self.neilf, self.light_solver, places)
+        for summary in () if improved is None else improved.summaries:
             CONSOLE.log(summary)
 
     def _pixels_on_device(self) -> PixelDataset:

@@ -40,9 +40,9 @@ __all__ = [
     "apply_plan",
     "apply_poses",
     "fit_poses",
+    "improve_half_trained",
     "observe_and_solve",
     "review_before_stage",
-    "search_material",
 ]
 
 Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
@@ -145,35 +145,35 @@ def apply_poses(run: Training) -> None:
         run.watch.pixels = poses.motion.of(given.checked)
 
 
-def search_material(run: Training, position: StagePosition, step: int) -> None:
-    """When it is due, search for paint taken for metal, or review metals that are off (`effects.review`).
+def improve_half_trained(run: Training, position: StagePosition, step: int) -> None:
+    """When it is due, correct the scale of light and material, and review metals (`effects.review`).
 
-    Both may train the BRDF field. The first process does this for all.
+    This may change the light and train the BRDF field. The first process does this for all.
     """
     model, max_pixels = run.model, _max_light_pixels(run)
     if max_pixels < MIN_PIXELS or not is_comparison_due(model, position):
         return
-    if not (model.brdf.metals or run.plan.is_open("metals")):
-        return
     decisions: list[Decision] = []
-    if run.fabric.is_global_zero:
+    may_change = model.brdf.metals or run.plan.is_open("metals") or run.light_solver.scale_is_free
+    if run.fabric.is_global_zero and may_change:
         with timed("light_fits", undivided=True):
             seed_stream(run.config.train.seed, Stream.SEARCH, step)
-            decisions = _search_at(light_places(model, run.pixels, max_pixels), run, step)
+            decisions = _improve_at(light_places(model, run.pixels, max_pixels), run, step)
         _report(run, decisions)
+    _share_light(run)
     _share_decisions(run, decisions)
     if run.fabric.world_size > 1:
         model.brdf.load_state_dict(run.fabric.broadcast(model.brdf.state_dict()))
 
 
-def _search_at(places: Places, run: Training, step: int) -> list[Decision]:
-    """`search_material` at given places."""
-    if not run.model.brdf.metals:
-        return review_metals(run.plan, run.model, places, step)
-    summary = improve_material(run.model, places)
-    if summary is not None:
+def _improve_at(places: Places, run: Training, step: int) -> list[Decision]:
+    """`improve_half_trained` at given places."""
+    improved = improve_material(run.model, run.light_solver, places)
+    if improved is None:
+        return []
+    for summary in improved.summaries:
         run.reporter.say(summary)
-    return []
+    return review_metals(run.plan, run.model, improved.lit, step)
 
 
 def _max_light_pixels(run: Training) -> int:

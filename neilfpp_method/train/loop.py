@@ -44,9 +44,9 @@ from neilfpp_method.train.evidence import (
     apply_plan,
     apply_poses,
     fit_poses,
+    improve_half_trained,
     observe_and_solve,
     review_before_stage,
-    search_material,
 )
 from neilfpp_method.train.health_record import read_findings, write_findings
 from neilfpp_method.train.json_files import read_json
@@ -122,7 +122,7 @@ def _train_stage(run: Training, optimizer: torch.optim.Optimizer, position: Stag
         if restore_surface(model.host, reached):
             run.reporter.say(f"step {step}: the surface had vanished and is restored")
         fit_poses(run, reached, step)
-        search_material(run, reached, step)
+        improve_half_trained(run, reached, step)
         _check_quality(run, reached, step)
         run.seconds[stage.value] = before + time.perf_counter() - started
         if number == length:

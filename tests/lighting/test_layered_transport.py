@@ -54,4 +54,5 @@ def test_the_layers_of_a_light_are_those_of_its_map_times_its_radiance_and_those
         sent = lit @ lamps.lit_intensity
         expected[1 + 2 * number : 3 + 2 * number] += sent[1:]
         expected[0] += sent[0] if number == 0 else 0
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found.light + found.scene, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(found.scene, transport.scene)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -19,7 +19,7 @@ from neilfpp_method.effects.places.grid import (
     relative_error,
 )
 from neilfpp_method.fields.light import LightModel
-from neilfpp_method.lighting.layered_transport import layers_at, light_layers
+from neilfpp_method.lighting.layered_transport import LightLayers, layers_at, light_layers
 from neilfpp_method.lighting.objective import DARK_FLOOR
 from neilfpp_method.lighting.transport import outgoing_radiance
 from neilfpp_method.model import NeilfModel
@@ -47,19 +47,29 @@ class LitPlaces:
 
     Attributes:
         places: the places with their pixels, in linear radiance.
-        parts: the parts of L_o of each pixel under that light (`lighting.layered_transport`).
+        layers: the layers of L_o of each pixel that this light and the scene cause.
         near: indices of the neighbours of each place, including itself.
         typical: radiance of a typical pixel.
     """
 
     places: Places
-    parts: Float[Tensor, "K N 3"]
+    layers: LightLayers
     near: Int[Tensor, "P M"]
     typical: float
 
+    @property
+    def parts(self) -> Float[Tensor, "K N 3"]:
+        """The layers of L_o of each pixel."""
+        return self.layers.light + self.layers.scene
+
+    def dimmed(self, factor: float) -> LitPlaces:
+        """The same places under a light that is weaker by this factor; the radiance of the scene is kept."""
+        return replace(self, layers=LightLayers(self.layers.light / factor, self.layers.scene))
+
     def where(self, rows: Int[Tensor, " R"]) -> LitPlaces:
         """The same places with only some of the pixels."""
-        return LitPlaces(self.places.where(rows), self.parts[:, rows], self.near, self.typical)
+        layers = LightLayers(self.layers.light[:, rows], self.layers.scene[:, rows])
+        return LitPlaces(self.places.where(rows), layers, self.near, self.typical)
 
     def hold_back(self, fold: int, folds: int) -> Split[LitPlaces]:
         """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
@@ -100,6 +110,10 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     shared = places.shared_points()
     light = LightModel(model.light, model.lamps)
     draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]
+    layers = LightLayers(
+        torch.stack([drawn.light for drawn in draws]).mean(0),
+        torch.stack([drawn.scene for drawn in draws]).mean(0),
+    )
     look = COLOR_SCALE * model.brdf(shared.position).base_color.clamp_min(DARK_FLOOR).log()
     near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
-    return LitPlaces(places, torch.stack(draws).mean(0), near, model.facts.median_radiance)
+    return LitPlaces(places, layers, near, model.facts.median_radiance)

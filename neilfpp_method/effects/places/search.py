@@ -21,9 +21,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.grid import BestMaterials
-from neilfpp_method.effects.places.lit import METAL, PAINT, LitPlaces, light_up
+from neilfpp_method.effects.places.lit import METAL, PAINT, LitPlaces
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.model import NeilfModel
@@ -36,7 +35,6 @@ __all__ = [
     "SearchedMaterial",
     "found_in",
     "is_comparison_due",
-    "is_search_due",
     "search_materials",
     "teach",
 ]
@@ -90,13 +88,8 @@ class SearchedMaterial:
     share: float
 
 
-def is_search_due(model: NeilfModel, position: StagePosition) -> bool:
-    """Whether paint is searched for among metals after `position.step` steps of a stage."""
-    return model.brdf.metals and is_comparison_due(model, position)
-
-
 def is_comparison_due(model: NeilfModel, position: StagePosition) -> bool:
-    """Whether materials are compared after `position.step` steps: by a search, or a review of metals.
+    """Whether the materials of places are compared after `position.step` steps (`review.improve_material`).
 
     They never are if the light is not an environment map, or if the settings leave out highlights.
     """
@@ -108,18 +101,17 @@ def is_comparison_due(model: NeilfModel, position: StagePosition) -> bool:
 
 
 @torch.no_grad()
-def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
+def search_materials(brdf: BrdfField, lit: LitPlaces) -> SearchedMaterial:
     """Search for paint that was taken for metal, under the current light of a model.
 
     Args:
-        model: gives the light, which is an environment map, the scene, the lobe and the materials.
-        places: places with their pixels in the training views, in linear radiance.
+        brdf: gives the current materials.
+        lit: places under the light of the model.
 
     Returns:
         Materials at the points that the pixels show.
     """
-    lit = light_up(model, places)
-    current = model.brdf(lit.places.shared_points().position)
+    current = brdf(lit.places.shared_points().position)
     loss, roughness = lit.loss(current), current.roughness[:, 0]
     paint, metal = lit.best(PAINT), lit.best(METAL)
     best = metal.where(metal.loss < paint.loss, paint)
@@ -127,7 +119,7 @@ def search_materials(model: NeilfModel, places: Places) -> SearchedMaterial:
     chosen = best.where(~is_matte, paint)
     is_other = (current.metallic - chosen.material.metallic)[:, 0] >= MIN_CHANGE
     is_judged = (roughness >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
-    return found_in(lit, model.brdf, chosen, is_other & is_judged & (chosen.loss < MAX_RATIO * loss))
+    return found_in(lit, brdf, chosen, is_other & is_judged & (chosen.loss < MAX_RATIO * loss))
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from torch import nn
 from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
 from neilfpp_method.effects.places.data import PlaceData, place_transport
 from neilfpp_method.effects.places.gathering import MIN_COSINE, SAME_NORMAL, Places
-from neilfpp_method.effects.places.search import is_search_due
+from neilfpp_method.effects.places.search import is_comparison_due
 from neilfpp_method.effects.review import improve_material
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.lighting.solver import LightSolver
@@ -68,7 +68,7 @@ class PlaceSolver(nn.Module):
         self._steps += 1
 
     def before_step(self, model: NeilfModel, light_solver: LightSolver, position: StagePosition) -> None:
-        """Start the light, or search for paint taken for metal, if this is due before a step with material.
+        """Start the light, or improve light and material, if this is due before a step with material.
 
         This changes parameters, which is not allowed between the losses of a step and their gradients.
         """
@@ -77,10 +77,10 @@ class PlaceSolver(nn.Module):
             if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
                 self._tried = True
                 self._start_light(model, light_solver)
-            if is_search_due(model, position) and position.step != self._searched:
+            if is_comparison_due(model, position) and position.step != self._searched:
                 self._searched = position.step
-                summary = improve_material(model, self.places())
-                if summary is not None:
+                improved = improve_material(model, light_solver, self.places())
+                for summary in () if improved is None else improved.summaries:
                     self.say(summary)
 
     @torch.no_grad()

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.places.search import (
     SEARCH_AT,
     SearchedMaterial,
-    is_search_due,
+    is_comparison_due,
     search_materials,
     teach,
 )
@@ -57,9 +58,13 @@ def trained_to(material: Material, places: Places) -> NeilfModel:
     return model
 
 
+def search(model: NeilfModel, places: Places) -> SearchedMaterial:
+    return search_materials(model.brdf, light_up(model, places))
+
+
 def test_black_paint_that_was_learned_as_dark_metal_becomes_paint(places: Places):
     model = trained_to(METAL, places)
-    searched = search_materials(model, places)
+    searched = search(model, places)
     assert searched.share > 0.8
     teach(model.brdf, searched)
     with torch.no_grad():
@@ -71,7 +76,7 @@ def test_black_paint_that_was_learned_as_dark_metal_becomes_paint(places: Places
 
 def test_the_right_material_is_kept(places: Places):
     model = trained_to(PAINT, places)
-    searched = search_materials(model, places)
+    searched = search(model, places)
     assert searched.share < 0.2
     before = model.brdf(places.observed.position)
     kept = (searched.material.metallic == before.metallic).float().mean()
@@ -81,7 +86,7 @@ def test_the_right_material_is_kept(places: Places):
 def test_paint_does_not_become_metal():
     one = torch.ones(COUNT, 1)
     metal = ball(0.6 * one.expand(-1, 3), 0.3 * one, one, LOBE, VIEWS, fine_sky())
-    assert search_materials(trained_to(PAINT, metal), metal).share == 0
+    assert search(trained_to(PAINT, metal), metal).share == 0
 
 
 def matte(base_color: float, metallic: float, roughness: float = 0.9) -> Material:
@@ -91,7 +96,7 @@ def matte(base_color: float, metallic: float, roughness: float = 0.9) -> Materia
 def test_matte_paint_that_was_learned_as_rough_metal_becomes_paint():
     one = torch.ones(COUNT, 1)
     stone = ball(0.3 * one.expand(-1, 3), 0.9 * one, 0 * one, LOBE, VIEWS, fine_sky())
-    searched = search_materials(trained_to(matte(0.4, 0.8), stone), stone)
+    searched = search(trained_to(matte(0.4, 0.8), stone), stone)
     assert searched.share > 0.8
     assert searched.material.metallic.median() == 0
 
@@ -100,27 +105,26 @@ def test_rough_metal_is_kept():
     """The field is not exact, so that its error does not decide alone."""
     one = torch.ones(COUNT, 1)
     iron = ball(0.6 * one.expand(-1, 3), 0.75 * one, one, LOBE, VIEWS, fine_sky())
-    assert search_materials(trained_to(matte(0.52, 0.9, 0.8), iron), iron).share < 0.2
+    assert search(trained_to(matte(0.52, 0.9, 0.8), iron), iron).share < 0.2
 
 
 def due_after(model: NeilfModel, length: int) -> list[int]:
     """The numbers of steps of material init after which a search is due."""
     positions = [StagePosition(Stage.MATERIAL_INIT, n, length) for n in range(1, length + 1)]
-    return [position.step for position in positions if is_search_due(model, position)]
+    return [position.step for position in positions if is_comparison_due(model, position)]
 
 
-def test_a_search_is_due_once_at_each_of_its_times():
+def test_a_comparison_is_due_once_at_each_of_its_times():
     model = sphere_model(preset("fast"))
     for length in (3, 7, 1500):
         assert due_after(model, length) == [math.ceil(share * length) for share in SEARCH_AT]
-    assert not any(is_search_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
+    assert not any(is_comparison_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
 
 
-def test_nothing_is_searched_under_a_free_light_or_without_highlights_or_metals():
-    matte, painted = sphere_model(preset("fast")), sphere_model(preset("fast"))
+def test_nothing_is_compared_under_a_free_light_or_without_highlights():
+    matte = sphere_model(preset("fast"))
     matte.lobe = None
-    painted.brdf.use(dataclasses.replace(painted.config.brdf, metals=False))
-    for model in (matte, painted, sphere_model(preset("paper-ngp"))):
+    for model in (matte, sphere_model(preset("paper-ngp"))):
         assert due_after(model, 30) == []
 
 

@@ -1,0 +1,70 @@
+"""The correction of the scale between light and base colour."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.lit import light_up
+from neilfpp_method.effects.places.rescaling import correct_scale
+from neilfpp_method.lighting.solver import MapSolver
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.structures import Material
+from tests.effects.balls import ball
+from tests.effects.places.test_search import LOBE, fine_sky, trained_to
+
+COUNT, VIEWS = 160, 10
+BASE_COLOR, ROUGHNESS = 0.3, 0.25
+
+
+def painted(base_color: float, metallic: float = 0.0) -> Material:
+    return Material(*(torch.full((1, n), v) for n, v in ((3, base_color), (1, ROUGHNESS), (1, metallic))))
+
+
+@pytest.fixture(scope="module")
+def places() -> Places:
+    """A ball of glossy paint under a sky."""
+    material = (value.expand(COUNT, -1) for value in vars(painted(BASE_COLOR)).values())
+    return ball(*material, LOBE, VIEWS, fine_sky())
+
+
+def mis_scaled(factor: float, places: Places, metallic: float = 0.0) -> tuple[NeilfModel, MapSolver]:
+    """A model with base colours that are too bright by a factor, under a light that is too weak by it."""
+    model = trained_to(painted(BASE_COLOR * factor, metallic), places)
+    model.light.log_radiance.data -= math.log(factor)
+    solver = model.light_solver()
+    solver.log_mean_base_color.fill_(math.log(BASE_COLOR * factor))
+    return model, solver
+
+
+@pytest.mark.parametrize("factor", [0.75, 1.0, 1.3])
+def test_the_true_scale_is_found_and_kept_by_later_fits(places: Places, factor: float):
+    model, solver = mis_scaled(factor, places)
+    rescaled = correct_scale(model, solver, light_up(model, places))
+    assert rescaled.before == pytest.approx(BASE_COLOR * factor, rel=5e-3)
+    assert rescaled.factor == pytest.approx(1 / factor, rel=0.06)
+    with torch.no_grad():
+        learned = model.brdf(places.observed.position).base_color
+    assert learned.median() == pytest.approx(BASE_COLOR, rel=0.06)
+    torch.testing.assert_close(
+        model.light.log_radiance.mean(), fine_sky().log_radiance.mean(), atol=0.06, rtol=0
+    )
+    assert solver.log_mean_base_color.exp() == pytest.approx(BASE_COLOR, rel=0.06)
+    changed = light_up(model, places)
+    torch.testing.assert_close(rescaled.lit.parts.mean(), changed.parts.mean(), rtol=0.02, atol=0)
+
+
+def test_a_known_scale_is_not_changed(places: Places):
+    model, solver = mis_scaled(1.3, places)
+    before = model.light.log_radiance.clone()
+    solver.log_mean_base_color.fill_(math.inf)
+    assert correct_scale(model, solver, light_up(model, places)) is None
+    assert torch.equal(model.light.log_radiance, before)
+
+
+def test_metals_do_not_reveal_the_scale(places: Places):
+    model, solver = mis_scaled(1.3, places, metallic=0.9)
+    assert correct_scale(model, solver, light_up(model, places)) is None
