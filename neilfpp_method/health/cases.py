@@ -21,6 +21,7 @@ __all__ = [
     "MATERIAL_AT_BOUNDS",
     "NOTHING_SHADED",
     "NO_SURFACE",
+    "OFF_CLOUD",
     "SKIPPED_STEPS",
     "Case",
     "Finding",
@@ -45,6 +46,10 @@ only few rays do.
 MAX_AT_BOUND = 0.2
 """Maximum share of the surface whose base colour is black or white. Runs with a light of the right scale had
 at most 9 %, a dark statue under a light that was 25 times too dim 42 %.
+"""
+MAX_OFF_CLOUD = 0.2
+"""Largest median distance between the surface and the point cloud that supervises it, in scene units. It was
+0.01 to 0.04 in captures of objects, a castle and a table, and 0.5 to 0.6 with a shell in front of the object.
 """
 MAX_EMPTY_STEPS = 50
 """Number of consecutive steps of a material stage without a surface point that is a finding."""
@@ -109,6 +114,13 @@ FOG = Case(
     remedy="check the scene box (`neilfpp inspect` draws that of a capture), give masks, or train the "
     "geometry for more steps (train.sdf_steps)",
 )
+OFF_CLOUD = Case(
+    name="off_point_cloud",
+    severe=False,
+    cause="views that overlap so little that a shell in front of the object explains them as well",
+    remedy="raise the weight of the cloud (loss.point_cloud to 1) or take more images; if the cloud is "
+    "wrong, leave it out (loss.point_cloud 0)",
+)
 NOTHING_SHADED = Case(
     name="nothing_shaded",
     severe=True,
@@ -141,13 +153,16 @@ SKIPPED_STEPS = Case(
 
 
 def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
-    """Find `NO_SURFACE` or `FOG`, at the end of a stage that trains the surface or later."""
+    """Find `NO_SURFACE`, `FOG` or `OFF_CLOUD`, at the end of a stage that trains the surface or later."""
     if measured.opaque < MIN_OPAQUE:
         what = f"only {measured.opaque:.0%} of the object's pixels show a surface"
         return [NO_SURFACE.found(step, what)]
     if measured.sharp < MIN_SHARP:
         what = f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is fog"
         return [FOG.found(step, what)]
+    if measured.off_cloud is not None and measured.off_cloud > MAX_OFF_CLOUD:
+        what = f"half of the surface is {measured.off_cloud:.2f} scene units or more from the point cloud"
+        return [OFF_CLOUD.found(step, what)]
     return []
 
 

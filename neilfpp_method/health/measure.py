@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from neilfpp_method.hosts.base import HasPointCloud, Host
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.structures import Material, PixelBatch, SurfaceHits
+from neilfpp_method.structures import Material, OrientedPoints, PixelBatch, SurfaceHits
 
 __all__ = ["SurfaceMeasurement", "measure_hits", "measure_surface"]
 
+CLOUD_POINTS = 20_000
+"""Maximum number of points of the cloud with which a surface is compared."""
 OPAQUE = 0.5
 """Opacity above which a ray counts as opaque."""
 AT_BOUND = 0.02
@@ -27,12 +32,15 @@ class SurfaceMeasurement:
         sharp: share of the opaque rays that hit a single surface, rather than fog or several surfaces.
         at_bound: share of the surface points whose base colour is within `AT_BOUND` of 0 or 1 in every
             channel; None without a material.
+        off_cloud: median distance of the surface points from the point cloud that supervises the surface,
+            scene units; None without a cloud or surface points.
     """
 
     rays: int
     opaque: float
     sharp: float
     at_bound: float | None
+    off_cloud: float | None = None
 
 
 @torch.no_grad()
@@ -57,11 +65,21 @@ def measure_hits(model: NeilfModel, hits: SurfaceHits, with_material: bool) -> S
     at_bound = None
     if with_material and sharp.any():
         at_bound = _share_at_bound(model.materials(hits.position[sharp]))
-    return SurfaceMeasurement(len(hits), _share(opaque), _share(sharp[opaque]), at_bound)
+    off_cloud = _off_cloud(model.host, hits.position[sharp])
+    return SurfaceMeasurement(len(hits), _share(opaque), _share(sharp[opaque]), at_bound, off_cloud)
 
 
 def _share(flags: torch.Tensor) -> float:
     return flags.float().mean().item() if len(flags) else 0.0
+
+
+def _off_cloud(host: Host, position: Float[Tensor, "N 3"]) -> float | None:
+    cloud = host.points if isinstance(host, HasPointCloud) else None
+    # Hosts of others may have points of another kind.
+    if not isinstance(cloud, OrientedPoints) or not len(cloud.position) or not len(position):
+        return None
+    drawn = cloud.position[:: -(-len(cloud.position) // CLOUD_POINTS)]
+    return torch.cdist(position, drawn).amin(1).median().item()
 
 
 def _share_at_bound(material: Material) -> float:

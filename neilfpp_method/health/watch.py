@@ -13,6 +13,7 @@ from neilfpp_method.health.cases import (
     MATERIAL_AT_BOUNDS,
     NO_SURFACE,
     NOTHING_SHADED,
+    OFF_CLOUD,
     SKIPPED_STEPS,
     Case,
     Finding,
@@ -70,7 +71,7 @@ class Watch:
 
     def judge(self, measured: SurfaceMeasurement, skipped: int, step: int) -> None:
         """Check a measurement and the number of steps skipped so far."""
-        self._replace([NO_SURFACE, FOG], surface_findings(measured, step))
+        self._replace([NO_SURFACE, FOG, OFF_CLOUD], surface_findings(measured, step))
         self._replace([MATERIAL_AT_BOUNDS], material_findings(measured, step))
         self._replace([SKIPPED_STEPS], skipped_steps(skipped, step))
 

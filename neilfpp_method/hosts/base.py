@@ -16,10 +16,11 @@ from torch.nn import Parameter
 
 from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.schedule import StageTable
-from neilfpp_method.structures import LossTerms, PixelBatch, RayBatch, SceneLight, SurfaceHits
+from neilfpp_method.structures import LossTerms, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 
 __all__ = [
     "HasParameterGroups",
+    "HasPointCloud",
     "HasRadiance",
     "HasSdf",
     "HasStages",
@@ -176,6 +177,17 @@ class HasSdf(Protocol):
     def sdf(self, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
         """Signed distance at points of the scene frame, negative inside."""
         ...
+
+
+@runtime_checkable
+class HasPointCloud(Protocol):
+    """A host whose surface a point cloud supervises. Without it health checks do not compare the two.
+
+    Attributes:
+        points: oriented points on the surface, scene frame; None without a cloud.
+    """
+
+    points: OrientedPoints | None
 
 
 @runtime_checkable

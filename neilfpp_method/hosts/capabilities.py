@@ -111,6 +111,13 @@ CAPABILITIES = (
         reported=True,
     ),
     Capability(
+        "points",
+        base.HasPointCloud,
+        "health checks",
+        "health.measure",
+        "the surface is not compared with a point cloud",
+    ),
+    Capability(
         "read_outputs",
         base.ReadsOutputs,
         "`losses` and `maps`, if they are given rendered outputs",

@@ -14,7 +14,7 @@ import numpy as np
 from neilfpp_method.data.files.images import write_exr, write_png
 from tests.data.make_capture import srgb
 from tests.hard_cases.known_ball import RADIUS, KnownBall
-from tests.hard_cases.known_shapes import Distance, meet
+from tests.hard_cases.known_shapes import INSIDE, Distance, Seen, meet
 
 Array = np.ndarray
 Look = Callable[[Array, Array], tuple[Array, Array]]
@@ -55,9 +55,16 @@ def look_at_shape(shape: Distance) -> Look:
 
 
 def write_capture(
-    root: Path, look: Look, views: int = 20, size: int = 32, frame: float = 2.0, hdr: bool = True
+    root: Path,
+    look: Look,
+    views: int = 20,
+    size: int = 32,
+    frame: float = 2.0,
+    hdr: bool = True,
+    inside: bool = False,
+    cloud: Seen | None = None,
 ) -> Path:
-    """Write a capture in the layout of the NeILF datasets, with masks and without a point cloud or maps.
+    """Write a capture in the layout of the NeILF datasets, without maps.
 
     The cameras are spread over the sphere, as in `known_shapes.photograph`.
 
@@ -65,9 +72,12 @@ def write_capture(
         size: width and height of the images in pixels.
         frame: width of an image at the origin, scene units.
         hdr: linear EXR, or PNG with 8-bit sRGB values.
+        inside: the cameras stand near the origin and look away from it, with a field of view of 90°.
+        cloud: the point cloud of the capture, which has no masks then.
     """
     inputs, suffix = root / "inputs", ".exr" if hdr else ".png"
-    focal, center = DISTANCE * size / frame, size / 2
+    distance = INSIDE if inside else DISTANCE
+    focal, center = size / 2 if inside else DISTANCE * size / frame, size / 2
     across, up = np.meshgrid(np.arange(size) + 0.5 - center, np.arange(size) + 0.5 - center)
     local = np.stack((across, up, np.full_like(across, focal)), -1).reshape(-1, 3)
     local /= np.linalg.norm(local, axis=-1, keepdims=True)
@@ -76,17 +86,19 @@ def write_capture(
         height, turn = 0.9 * (1 - (2 * view + 1) / views), view * np.pi * (3 - np.sqrt(5))
         flat = np.sqrt(1 - height**2)
         outward = np.array([flat * np.cos(turn), flat * np.sin(turn), height])
-        right = np.cross(-outward, [0.0, 0.0, 1.0]) / flat
-        rotation = np.stack((right, np.cross(-outward, right), -outward))
-        hit, color = look(np.broadcast_to(DISTANCE * outward, local.shape), local @ rotation)
+        forward = outward if inside else -outward
+        right = np.cross(forward, [0.0, 0.0, 1.0]) / flat
+        rotation = np.stack((right, np.cross(forward, right), forward))
+        hit, color = look(np.broadcast_to(distance * outward, local.shape), local @ rotation)
         color, name = color.reshape(size, size, 3), f"{view:03d}"
         if hdr:
             write_exr(inputs / "images" / f"{name}.exr", {"RGB": color.astype(np.float32)})
         else:
             write_png(inputs / "images" / f"{name}.png", np.rint(255 * srgb(color)).astype(np.uint8))
-        write_png(inputs / "masks" / f"{name}.png", 255 * hit.reshape(size, size).astype(np.uint8))
+        if cloud is None:
+            write_png(inputs / "masks" / f"{name}.png", 255 * hit.reshape(size, size).astype(np.uint8))
         w2c = np.eye(4)
-        w2c[:3, :3], w2c[2, 3] = rotation, DISTANCE
+        w2c[:3, :3], w2c[2, 3] = rotation, -distance if inside else distance
         camera = {
             "intrinsic": {"focal": [focal, focal], "ppt": [center, center]},
             "extrinsic": w2c.reshape(-1).tolist(),
@@ -98,6 +110,18 @@ def write_capture(
         "image_path": {"file_paths": files},
         "bbox": {"transform": np.diag([2.0, 2.0, 2.0, 1.0]).reshape(-1).tolist()},
     }
+    if cloud is not None:
+        write_cloud(inputs / "model" / "oriented_pcd.ply", cloud)
     (inputs / "sfm_scene.json").write_text(json.dumps(scene))
     (root / "split.json").write_text(json.dumps({"test": [0]}))
     return root
+
+
+def write_cloud(path: Path, seen: Seen) -> None:
+    """Write the visible points of a shape with their normals as a PLY file."""
+    columns = np.concatenate((seen.position, seen.normal), -1)[seen.hit]
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    path.parent.mkdir()
+    with path.open("w") as file:
+        file.write(f"ply\nformat ascii 1.0\nelement vertex {len(columns)}\n{properties}end_header\n")
+        np.savetxt(file, columns, fmt="%.6f")

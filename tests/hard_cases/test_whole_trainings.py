@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,13 +63,19 @@ SURFACE_ONLY = {"train.sdf_steps": 400, "train.rays": 192, "train.material_steps
 """Differences from `SMALLER` for shapes whose material is not compared."""
 
 
-def trained(look: Look, folder: Path, hdr: bool = True, changes: Mapping[str, object] | None = None) -> Run:
+def trained(
+    look: Look,
+    folder: Path,
+    hdr: bool = True,
+    changes: Mapping[str, object] | None = None,
+    **capture: Any,
+) -> Run:
     """Write a capture, train it as `neilfpp train` does, and load the run.
 
     Poses and exposures are not corrected, as `--effects auto` decides here; the evidence for the other
-    effects is not measured, which would take minutes.
+    effects is not measured, which would take minutes. `capture` are options of `write_capture`.
     """
-    root = write_capture(folder / "capture", look, hdr=hdr)
+    root = write_capture(folder / "capture", look, hdr=hdr, **capture)
     config = changed(preset("fast"), {**SMALLER, **(changes or {})})
     effects = EffectRequest("as-set", {"poses": False, "exposure": False})
     request = TrainingRequest(data=root, out=folder / "run", config=config, effects=effects, device="cpu")
@@ -177,9 +184,30 @@ CASES = {
         },
     ),
 }
+
+
+@dataclass(frozen=True)
+class WithoutOutline:
+    """A shape that fills every image, so that only its point cloud limits it, and the largest errors."""
+
+    largest: SurfaceErrors
+    frame: float = 2.0
+    inside: bool = False
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        """Options of `known_shapes.photograph` and of `write_capture`."""
+        return {"views": 24, "frame": self.frame, "inside": self.inside}
+
+
 THIN = {
     "thin plate": SurfaceErrors(outline=0.056, normal=16.0, position=0.03, color=0.0075),
     "wire": SurfaceErrors(outline=0.26, normal=21.5, position=0.012, color=0.0033),
+}
+
+WITHOUT_OUTLINE = {
+    "cube": WithoutOutline(SurfaceErrors(outline=0.001, normal=6.0, position=0.006, color=0.018), frame=0.7),
+    "room": WithoutOutline(SurfaceErrors(outline=0.001, normal=4.5, position=0.006, color=0.01), inside=True),
 }
 
 
@@ -201,3 +229,13 @@ def test_a_thin_shape_is_recovered_from_its_hull(tmp_path, name):
     run = trained(look_at_shape(shape), tmp_path, changes=SURFACE_ONLY)
     truth = shapes.photograph(shape, 2000, views=40, seed=1)
     check(surface_errors(run.model, truth), asdict(THIN[name]))
+
+
+@pytest.mark.parametrize("name", WITHOUT_OUTLINE)
+def test_a_shape_that_fills_every_image_is_recovered_with_its_cloud(tmp_path, name):
+    shape, case = shapes.SHAPES[name], WITHOUT_OUTLINE[name]
+    cloud = shapes.photograph(shape, 2000, seed=0, **case.camera)
+    changes = {**SURFACE_ONLY, "loss.point_cloud": 1.0}
+    run = trained(look_at_shape(shape), tmp_path, changes=changes, cloud=cloud, **case.camera)
+    truth = shapes.photograph(shape, 2000, seed=1, **{**case.camera, "views": 40})
+    check(surface_errors(run.model, truth), asdict(case.largest))

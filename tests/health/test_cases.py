@@ -33,6 +33,11 @@ def test_a_missing_or_blurred_surface_is_a_finding(opaque, sharp, found):
     assert cases(surface_findings(SurfaceMeasurement(100, opaque, sharp, None), 7)) == found
 
 
+@pytest.mark.parametrize(("off", "found"), [(None, []), (0.05, []), (0.5, ["off_point_cloud"])])
+def test_a_surface_far_from_its_point_cloud_is_a_finding(off, found):
+    assert cases(surface_findings(SurfaceMeasurement(100, 1.0, 1.0, None, off), 7)) == found
+
+
 @pytest.mark.parametrize(("share", "found"), [(None, []), (0.1, []), (0.4, ["material_at_bounds"])])
 def test_a_material_at_its_bounds_is_a_finding(share, found):
     assert cases(material_findings(SurfaceMeasurement(100, 1.0, 1.0, share), 7)) == found

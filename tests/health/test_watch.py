@@ -24,6 +24,18 @@ PIXELS = sphere_batch(spread=0.1)
 """All of them meet the sphere."""
 
 
+def test_a_shell_in_front_of_its_point_cloud_is_a_finding():
+    """The surface of the model has a radius of 0.6."""
+    model = sphere_model()
+    direction = torch.nn.functional.normalize(torch.randn(30_000, 3), dim=-1)
+    for radius, cases in ((0.58, []), (0.3, ["off_point_cloud"])):
+        model.host.point_position, model.host.point_normal = radius * direction, direction
+        watch = Watch(PIXELS, print)
+        watch.after_stage(model, STAGES[Stage.SDF_INIT], 0, 40)
+        assert list(watch.findings) == cases
+    assert watch.record()["verdict"] == "doubtful"
+
+
 def hits_of(batch: PixelBatch, opacity: float, concentration: float) -> SurfaceHits:
     ones = torch.ones(len(batch.origins))
     return SurfaceHits(batch.color, batch.origins, -batch.directions, opacity * ones, concentration * ones)

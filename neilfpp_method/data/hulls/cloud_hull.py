@@ -29,6 +29,7 @@ from neilfpp_method.structures import OrientedPoints
 
 __all__ = ["find_cloud_hull"]
 
+NOTHING_HIDDEN = "the point cloud hides almost nothing from the cameras"
 DEPTH_SIDE = 96
 """Longer side of a depth map in pixels; a pixel then shows about as much as a cell of the cube is wide."""
 GAP = 2
@@ -67,9 +68,12 @@ def find_cloud_hull(
     cell = 2 * radius / resolution
     centers = torch.from_numpy(cell_centers(radius, resolution))
     points = points.to("cpu")
+    if not len(points.position):
+        return NOTHING_HIDDEN
     # A corner of the cube is seen by few views, all of them from behind the object.
     in_ball = centers.norm(dim=-1) < radius + MARGIN * cell
     views, hidden, empty = torch.zeros(3, len(centers))
+    point_views = torch.zeros(len(points.position))
     for camera in cameras:
         camera = _reduced(camera)
         projected = project(camera, centers)
@@ -79,13 +83,15 @@ def find_cloud_hull(
         in_front = projected.depth < first - TOLERANCE * cell
         known = first.isfinite()
         views += in_image
+        point_views += pixel_index(project(camera, points.position), camera) >= 0
         empty += known & in_front
         hidden += known & ~in_front
-    enough_views = views >= max(2, MIN_SEEN_SHARE * len(cameras))
+    # Cameras around an object show all points, those that look around in a room a few each.
+    enough_views = views >= max(2, MIN_SEEN_SHARE * point_views.median())
     hides = (hidden >= MIN_HIDDEN_SHARE * views) & (empty <= MAX_EMPTY_SHARE * views)
     solid = in_ball & enough_views & hides
     if solid.sum() < MIN_CELLS:
-        return "the point cloud hides almost nothing from the cameras"
+        return NOTHING_HIDDEN
     cube = solid.numpy().reshape(resolution, resolution, resolution)
     return DistanceCube(torch.from_numpy(signed_distance(cube, cell)), radius)
 

@@ -39,8 +39,10 @@ __all__ = [
     "teach",
 ]
 
-SEARCH_AT = (1 / 3, 2 / 3)
-"""Shares of material init after which materials are searched."""
+SEARCH_AT = (1 / 3, 2 / 3, 0.9)
+"""Shares of material init after which materials are searched. The scale is exact only under a light that has
+settled after the last correction; the last steps then adapt light and material to it.
+"""
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
 pixels (measured on `spot_city`: 22 of 105 s).

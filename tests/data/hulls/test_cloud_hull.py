@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 
 from neilfpp_method.data.hulls import cloud_hull
 from neilfpp_method.data.hulls.cloud_hull import find_cloud_hull
 from neilfpp_method.structures import OrientedPoints
-from tests.data.hulls.test_visual_hull import BALL, camera_at, ring
+from tests.data.hulls.test_visual_hull import BALL, SIZE, camera_at, ring
 
 RADIUS = 1.75
 RESOLUTION = 64
@@ -67,6 +69,21 @@ def test_space_that_no_point_hides_is_empty():
     assert behind < -0.2
     assert before > 0.2
     assert above > 0.2
+
+
+def test_the_hull_of_a_room_is_what_is_behind_its_walls():
+    """Cameras inside of a ball look away from each other, so that each of them shows a part of it."""
+    walls = ball()
+    room = OrientedPoints(walls.position, -walls.normal)
+    directions = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=3)))
+    directions = torch.nn.functional.normalize(directions[directions.any(-1)], dim=-1)
+    inside = [camera_at((-0.2 * direction).tolist(), focal=0.5 * SIZE) for direction in directions]
+    hull = find_cloud_hull(room, inside, RADIUS, RESOLUTION)
+    behind = 1.4 * directions
+    assert (hull.at(behind) < 0).all()
+    assert hull.at(torch.zeros(1, 3)) > 0.25
+    # In front of a point the hull begins 1½ cells and the width of a pixel earlier.
+    assert hull.at(walls.position).abs().median() < 2.5 * CELL
 
 
 def test_false_points_in_empty_space_are_removed():
