@@ -193,13 +193,16 @@ class Improved:
     summaries: list[str]
 
 
-def improve_material(model: NeilfModel, solver: LightSolver, places: Places) -> Improved | None:
+def improve_material(
+    model: NeilfModel, solver: LightSolver, places: Places, with_search: bool
+) -> Improved | None:
     """Correct the scale of a half-trained model, and replace metal by paint where paint is better.
 
     Args:
         model: its light is an environment map; see `places.search.is_comparison_due`.
         solver: keeps the scale in later fits of the light.
         places: places in the training views, with linear radiance.
+        with_search: whether to search for paint; without, only the scale is corrected.
 
     Returns:
         None if there are fewer than `MIN_PLACES` places.
@@ -211,7 +214,7 @@ def improve_material(model: NeilfModel, solver: LightSolver, places: Places) -> 
     if rescaled is not None:
         lit = rescaled.lit
         summaries.append(rescaled.summary())
-    if model.brdf.metals:
+    if with_search and model.brdf.metals:
         searched = search_materials(model.brdf, lit)
         if searched.share > 0:
             teach(model.brdf, searched)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.places.search import is_comparison_due
+from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import improve_material, light_places, review_light
@@ -193,11 +193,12 @@ class Steps:
     def _improve_half_trained(self, step: int) -> None:
         """When it is due, correct the scale of light and material, and replace metal by better paint."""
         position = stage_at(step, self.settings.train)
-        if not is_comparison_due(self.neilf, dataclasses.replace(position, step=position.step + 1)):
+        reached = dataclasses.replace(position, step=position.step + 1)
+        if not is_comparison_due(self.neilf, reached):
             return
         seed_stream(self.settings.train.seed, Stream.SEARCH, step + 1)
         places = light_places(self.neilf, self._pixels_on_device())
-        improved = improve_material(self.neilf, self.light_solver, places)
+        improved = improve_material(self.neilf, self.light_solver, places, is_search_due(reached))
         for summary in () if improved is None else improved.summaries:
             CONSOLE.log(summary)
 

@@ -12,7 +12,7 @@ from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.evidence.poses import next_motion
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.places.gathering import Places
-from neilfpp_method.effects.places.search import is_comparison_due
+from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
@@ -158,7 +158,8 @@ def improve_half_trained(run: Training, position: StagePosition, step: int) -> N
     if run.fabric.is_global_zero and may_change:
         with timed("light_fits", undivided=True):
             seed_stream(run.config.train.seed, Stream.SEARCH, step)
-            decisions = _improve_at(light_places(model, run.pixels, max_pixels), run, step)
+            places = light_places(model, run.pixels, max_pixels)
+            decisions = _improve_at(places, run, is_search_due(position), step)
         _report(run, decisions)
     _share_light(run)
     _share_decisions(run, decisions)
@@ -166,14 +167,14 @@ def improve_half_trained(run: Training, position: StagePosition, step: int) -> N
         model.brdf.load_state_dict(run.fabric.broadcast(model.brdf.state_dict()))
 
 
-def _improve_at(places: Places, run: Training, step: int) -> list[Decision]:
+def _improve_at(places: Places, run: Training, with_search: bool, step: int) -> list[Decision]:
     """`improve_half_trained` at given places."""
-    improved = improve_material(run.model, run.light_solver, places)
+    improved = improve_material(run.model, run.light_solver, places, with_search)
     if improved is None:
         return []
     for summary in improved.summaries:
         run.reporter.say(summary)
-    return review_metals(run.plan, run.model, improved.lit, step)
+    return review_metals(run.plan, run.model, improved.lit, step) if with_search else []
 
 
 def _max_light_pixels(run: Training) -> int:

@@ -32,16 +32,20 @@ from neilfpp_method.structures import Material
 __all__ = [
     "SEARCH_AT",
     "SEARCH_SHARE",
+    "SETTLED_AT",
     "SearchedMaterial",
     "found_in",
     "is_comparison_due",
+    "is_search_due",
     "search_materials",
     "teach",
 ]
 
-SEARCH_AT = (1 / 3, 2 / 3, 0.9)
-"""Shares of material init after which materials are searched. The scale is exact only under a light that has
-settled after the last correction; the last steps then adapt light and material to it.
+SEARCH_AT = (1 / 3, 2 / 3)
+"""Shares of material init after which materials are searched."""
+SETTLED_AT = 0.9
+"""Share of material init after which only the scale is corrected, under a light that has settled since the
+last correction. The training of the field on what a search finds would need more steps than are left.
 """
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
@@ -97,9 +101,17 @@ def is_comparison_due(model: NeilfModel, position: StagePosition) -> bool:
     """
     if model.lobe is None or not isinstance(model.light, EnvironmentLight):
         return False
-    return position.stage is Stage.MATERIAL_INIT and any(
-        position.step - 1 < share * position.length <= position.step for share in SEARCH_AT
-    )
+    return position.stage is Stage.MATERIAL_INIT and _has_reached(position, (*SEARCH_AT, SETTLED_AT))
+
+
+def is_search_due(position: StagePosition) -> bool:
+    """Whether a comparison after `position.step` steps includes the search, and the review of metals."""
+    return _has_reached(position, SEARCH_AT)
+
+
+def _has_reached(position: StagePosition, shares: tuple[float, ...]) -> bool:
+    """Whether one of these shares of the stage has just been reached."""
+    return any(position.step - 1 < share * position.length <= position.step for share in shares)
 
 
 @torch.no_grad()

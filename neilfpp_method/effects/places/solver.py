@@ -16,7 +16,7 @@ from torch import nn
 from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
 from neilfpp_method.effects.places.data import PlaceData, place_transport
 from neilfpp_method.effects.places.gathering import MIN_COSINE, SAME_NORMAL, Places
-from neilfpp_method.effects.places.search import is_comparison_due
+from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
 from neilfpp_method.effects.review import improve_material
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.lighting.solver import LightSolver
@@ -79,7 +79,7 @@ class PlaceSolver(nn.Module):
                 self._start_light(model, light_solver)
             if is_comparison_due(model, position) and position.step != self._searched:
                 self._searched = position.step
-                improved = improve_material(model, light_solver, self.places())
+                improved = improve_material(model, light_solver, self.places(), is_search_due(position))
                 for summary in () if improved is None else improved.summaries:
                     self.say(summary)
 
