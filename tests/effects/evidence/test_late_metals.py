@@ -45,7 +45,7 @@ def painted_model(places: Places, effects: str = "auto") -> tuple[Plan, NeilfMod
 def test_metal_that_the_trained_light_shows_is_switched_on_and_learned():
     places = two_halves(1.0)
     plan, model = painted_model(places)
-    (decision,) = review_metals(plan, model, places, 1000)
+    (decision,) = review_metals(plan, model, light_up(model, places), 1000)
     assert decision.on
     assert decision.step == 1000
     assert decision.reason.startswith("revised: reduction of the error in held-back views by metals")
@@ -61,7 +61,7 @@ def test_paint_does_not_earn_metals():
     places = two_halves(0.0)
     plan, model = painted_model(places)
     before = [parameter.clone() for parameter in model.brdf.parameters()]
-    (decision,) = review_metals(plan, model, places, 1000)
+    (decision,) = review_metals(plan, model, light_up(model, places), 1000)
     assert not decision.on
     assert not model.brdf.metals
     assert all(torch.equal(a, b) for a, b in zip(before, model.brdf.parameters(), strict=True))
@@ -79,8 +79,9 @@ def test_the_evidence_is_the_gain_of_the_metal_places():
 @pytest.mark.parametrize("effects", ["auto,-metals", "none", "as-set"])
 def test_what_the_user_has_decided_stays(effects):
     places = two_halves(1.0)
+    lit = light_up(painted_model(places)[1], places)
     plan, model = painted_model(places, effects)
-    assert review_metals(plan, model, places, 1000) == []
+    assert review_metals(plan, model, lit, 1000) == []
 
 
 def test_metals_that_are_on_are_not_reviewed():
@@ -88,4 +89,4 @@ def test_metals_that_are_on_are_not_reviewed():
     plan, model = painted_model(places)
     plan.decisions.append(Decision(5, "metals", True, "evidence", "as if measured"))
     model.use(plan.config)
-    assert review_metals(plan, model, places, 1000) == []
+    assert review_metals(plan, model, light_up(model, places), 1000) == []
