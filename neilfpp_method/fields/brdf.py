@@ -90,8 +90,8 @@ class BrdfField(nn.Module):
 
         Darker ones are multiplied by about the same factor. Brighter ones approach 1.
         """
-        brighter = min(factor * base_color, START_RANGE[1])
-        shift = math.atanh(2 * brighter - 1) - math.atanh(2 * base_color - 1)
+        before, after = (min(value, START_RANGE[1]) for value in (base_color, factor * base_color))
+        shift = math.atanh(2 * after - 1) - math.atanh(2 * before - 1)
         self.mlp.layers[-1].bias[:3] += shift
 
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:

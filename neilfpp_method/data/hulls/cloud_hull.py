@@ -30,6 +30,7 @@ from neilfpp_method.structures import OrientedPoints
 __all__ = ["find_cloud_hull"]
 
 NOTHING_HIDDEN = "the point cloud hides almost nothing from the cameras"
+"""Reason why there is no hull."""
 DEPTH_SIDE = 96
 """Longer side of a depth map in pixels; a pixel then shows about as much as a cell of the cube is wide."""
 GAP = 2

@@ -68,3 +68,10 @@ def test_a_known_scale_is_not_changed(places: Places):
 def test_metals_do_not_reveal_the_scale(places: Places):
     model, solver = mis_scaled(1.3, places, metallic=0.9)
     assert correct_scale(model, solver, light_up(model, places)) is None
+
+
+def test_a_white_field_can_become_brighter(places: Places):
+    brdf = mis_scaled(1.0, places)[0].brdf
+    before = brdf.mlp.layers[-1].bias.clone()
+    brdf.brighten(1.0, 1.3)
+    assert torch.equal(brdf.mlp.layers[-1].bias, before)
