@@ -1,6 +1,7 @@
 """Write images and masks of a known object into a folder, as a capture that `neilfpp train` reads.
 
-The cameras are written in NumPy, apart from the package's. The scene frame is the world frame.
+The cameras are written in NumPy, apart from the package's. The scene frame is the world frame, unless the
+world has another unit and origin.
 """
 
 from __future__ import annotations
@@ -63,6 +64,10 @@ def write_capture(
     hdr: bool = True,
     inside: bool = False,
     cloud: Seen | None = None,
+    masks: bool = True,
+    gains: Array | None = None,
+    unit: float = 1.0,
+    away: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Path:
     """Write a capture in the layout of the NeILF datasets, without maps.
 
@@ -73,7 +78,10 @@ def write_capture(
         frame: width of an image at the origin, scene units.
         hdr: linear EXR, or PNG with 8-bit sRGB values.
         inside: the cameras stand near the origin and look away from it, with a field of view of 90°.
-        cloud: the point cloud of the capture, which has no masks then.
+        cloud: the point cloud of the capture, if it has one.
+        gains: factor on the radiance of each view, (V,); if None, all are 1.
+        unit: length of a scene unit in the world.
+        away: the centre of the scene in the world, scene units.
     """
     inputs, suffix = root / "inputs", ".exr" if hdr else ".png"
     distance = INSIDE if inside else DISTANCE
@@ -91,37 +99,41 @@ def write_capture(
         rotation = np.stack((right, np.cross(forward, right), forward))
         hit, color = look(np.broadcast_to(distance * outward, local.shape), local @ rotation)
         color, name = color.reshape(size, size, 3), f"{view:03d}"
+        color = color if gains is None else gains[view] * color
         if hdr:
             write_exr(inputs / "images" / f"{name}.exr", {"RGB": color.astype(np.float32)})
         else:
             write_png(inputs / "images" / f"{name}.png", np.rint(255 * srgb(color)).astype(np.uint8))
-        if cloud is None:
+        if masks:
             write_png(inputs / "masks" / f"{name}.png", 255 * hit.reshape(size, size).astype(np.uint8))
         w2c = np.eye(4)
         w2c[:3, :3], w2c[2, 3] = rotation, -distance if inside else distance
+        w2c[:3, 3] = unit * (w2c[:3, 3] - rotation @ away)
         camera = {
             "intrinsic": {"focal": [focal, focal], "ppt": [center, center]},
             "extrinsic": w2c.reshape(-1).tolist(),
         }
         tracks[str(view)] = {"flg": 2, "size": [size, size], "camera": camera}
         files[str(view)] = f"images/{name}{suffix}"
+    box = np.diag([2.0 * unit, 2.0 * unit, 2.0 * unit, 1.0])
+    box[:3, 3] = unit * np.array(away)
     scene = {
         "camera_track_map": {"images": tracks},
         "image_path": {"file_paths": files},
-        "bbox": {"transform": np.diag([2.0, 2.0, 2.0, 1.0]).reshape(-1).tolist()},
+        "bbox": {"transform": box.reshape(-1).tolist()},
     }
     if cloud is not None:
-        write_cloud(inputs / "model" / "oriented_pcd.ply", cloud)
+        write_cloud(inputs / "model" / "oriented_pcd.ply", unit * (cloud.position + away), cloud)
     (inputs / "sfm_scene.json").write_text(json.dumps(scene))
     (root / "split.json").write_text(json.dumps({"test": [0]}))
     return root
 
 
-def write_cloud(path: Path, seen: Seen) -> None:
-    """Write the visible points of a shape with their normals as a PLY file."""
-    columns = np.concatenate((seen.position, seen.normal), -1)[seen.hit]
+def write_cloud(path: Path, position: Array, seen: Seen) -> None:
+    """Write the world positions of the visible points of a shape with their normals as a PLY file."""
+    columns = np.concatenate((position, seen.normal), -1)[seen.hit]
     properties = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     path.parent.mkdir()
     with path.open("w") as file:
         file.write(f"ply\nformat ascii 1.0\nelement vertex {len(columns)}\n{properties}end_header\n")
-        np.savetxt(file, columns, fmt="%.6f")
+        np.savetxt(file, columns, fmt="%.9g")

@@ -2,8 +2,9 @@
 
 The images are those of `known_ball`, made by quadrature apart from the package. An attached host knows the
 geometry, or the host is the ball as a mesh; material, and in some cases light, is learned. Each bound is 1.5
-to 2 times the error measured. What the images cannot tell has no bound: the roughness of a white surface
-under even light, the metallic of a black one.
+to 2 times the error measured, and below the error of a constant answer (`test_degenerate_answers`), so no
+true roughness is 0.5. What the images cannot tell has no bound: the roughness of a white surface under even
+light, the metallic of a black one.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import dataclasses
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -35,6 +38,7 @@ from neilfpp_method.shading.brdf import GGX
 from neilfpp_method.structures import Incident, Material, PixelBatch, RayBatch
 from tests.data.make_capture import srgb
 from tests.hard_cases.known_ball import RADIUS, Array, KnownBall, Photographed, photograph, sky, sun
+from tests.hard_cases.material_errors import Answer, Errors, compare
 from tests.scenes import meet_ball, tiny_config
 from tests.train.small_runs import solved_light
 
@@ -81,25 +85,6 @@ def settings(steps: int, known_map: Path | None, samples: int) -> NeilfConfig:
         optimizer=dataclasses.replace(config.optimizer, brdf=1e-2),
         train=dataclasses.replace(config.train, sdf_steps=0, material_steps=steps, joint_steps=0),
     )
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors at points and views that were not trained on.
-
-    Attributes:
-        base_color, roughness, metallic: mean absolute errors.
-        scaled_base_color: as base_color, after the best factor per channel, for a light that is not known.
-        image: mean absolute error of the shaded radiance over the mean radiance.
-        radiance: the same of the host's colour, which only a mesh trains.
-    """
-
-    base_color: float
-    roughness: float
-    metallic: float
-    scaled_base_color: float
-    image: float
-    radiance: float
 
 
 def batch_of(pixels: Photographed, color: np.ndarray, rows: np.ndarray | slice) -> PixelBatch:
@@ -171,17 +156,8 @@ def errors(neilf: AttachedNeilf, ball: KnownBall, truth: Photographed, unit: flo
     neilf.eval()
     rays = batch_of(truth, truth.color, slice(None)).rays
     maps, seen = neilf.maps(rays), neilf.model.host.render(rays).color
-    color, wanted = maps.base_color.numpy(), ball.base_color(truth.normal)
-    scale = (color * wanted).sum(0) / (color**2).sum(0)
-    mean = truth.color.mean()
-    return Errors(
-        base_color=float(np.abs(color - wanted).mean()),
-        roughness=float((maps.roughness - ball.roughness).abs().mean()),
-        metallic=float((maps.metallic - ball.metallic).abs().mean()),
-        scaled_base_color=float(np.abs(scale * color - wanted).mean()),
-        image=float(np.abs(maps.rgb.numpy() / unit - truth.color).mean() / mean),
-        radiance=float(np.abs(seen.numpy() / unit - truth.color).mean() / mean),
-    )
+    values = (maps.base_color, maps.roughness, maps.metallic, maps.rgb / unit, seen / unit)
+    return compare(Answer(*(value.double().numpy() for value in values)), ball, truth)
 
 
 # ------------------------------------------------------------------------------------------------------ cases
@@ -217,12 +193,12 @@ QUICK = {
     ),
     "over-exposed LDR": Case(
         dataclasses.replace(PAINT, environment=3.0 * sky()),
-        {"base_color": 0.1, "roughness": 0.2, "metallic": 0.2, "image": 0.3},
+        {"base_color": 0.03, "roughness": 0.057, "metallic": 0.037, "image": 0.095},
         {"response": "srgb"},
     ),
     "sun of 1e5": Case(
-        KnownBall(sun(1e5), roughness=0.5),
-        {"base_color": 0.04, "roughness": 0.04, "metallic": 0.05, "image": 0.08},
+        KnownBall(sun(1e5), roughness=0.6),
+        {"base_color": 0.026, "roughness": 0.065, "metallic": 0.045, "image": 0.04},
         {"by_lobe": False},
     ),
 }
@@ -237,7 +213,8 @@ LONG = {
         {"base_color": 0.015, "roughness": 0.07, "image": 0.07},
     ),
     "black": Case(
-        KnownBall(roughness=0.5, base_color=gray(0.0)), {"base_color": 0.03, "roughness": 0.02, "image": 0.13}
+        KnownBall(roughness=0.35, base_color=gray(0.0)),
+        {"base_color": 0.022, "roughness": 0.042, "image": 0.13},
     ),
     "LDR": Case(
         PAINT,
@@ -263,33 +240,54 @@ LONG = {
         {"base_color": 0.011, "roughness": 0.014, "metallic": 0.028, "image": 0.04, "radiance": 0.14},
         {"mesh": True, "response": "srgb"},
     ),
-    "light not known": Case(
-        PAINT, {"scaled_base_color": 0.19, "roughness": 0.25, "image": 0.11}, {"known_light": False}
-    ),
+    "light not known": Case(PAINT, {"scaled_base_color": 0.145, "image": 0.12}, {"known_light": False}),
+    # A constant is right here. What fails is a texture of the light or of the material that is not there.
     "white on white, light not known": Case(
         KnownBall(EVEN, roughness=0.7, base_color=gray(0.9)),
-        {"scaled_base_color": 0.01, "image": 0.04},
+        {"scaled_base_color": 0.005, "image": 0.015},
         {"known_light": False},
     ),
 }
 
 
-def check(case: Case, folder: Path) -> None:
-    found = learn(case.ball, folder, **case.options)
+NOT_RECOVERED = [("light not known", "roughness", 0.1)]
+"""Cases of `LONG` and bounds that are exceeded, each as large as would be useful."""
+
+
+def check(found: Errors, bounds: Mapping[str, float]) -> None:
     print(found)  # shown by pytest -rA
-    for name, bound in case.bounds.items():
+    for name, bound in bounds.items():
         assert getattr(found, name) <= bound, f"{name}: {found}"
+
+
+@cache
+def errors_of(name: str) -> Errors:
+    """Train a case of `LONG`, once per process, and measure its errors."""
+    with TemporaryDirectory() as folder:
+        return learn(LONG[name].ball, Path(folder), **LONG[name].options)
 
 
 @pytest.mark.parametrize("name", QUICK)
 def test_recovered_materials_are_accurate(tmp_path, name):
-    check(QUICK[name], tmp_path)
+    check(learn(QUICK[name].ball, tmp_path, **QUICK[name].options), QUICK[name].bounds)
 
 
 @pytest.mark.hard
 @pytest.mark.parametrize("name", LONG)
-def test_recovered_materials_are_accurate_in_more_cases(tmp_path, name):
-    check(LONG[name], tmp_path)
+def test_recovered_materials_are_accurate_in_more_cases(name):
+    check(errors_of(name), LONG[name].bounds)
+
+
+@pytest.mark.hard
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="under a light that is not known, paint is found too rough: a constant of 0.5 is better "
+    "(docs/stability.md)",
+)
+@pytest.mark.parametrize(("name", "measure", "bound"), NOT_RECOVERED)
+def test_values_that_are_not_recovered(name, measure, bound):
+    check(errors_of(name), {measure: bound})
 
 
 @pytest.mark.hard
@@ -300,7 +298,7 @@ def test_recovered_materials_are_accurate_in_more_cases(tmp_path, name):
 )
 def test_polished_metal_is_not_estimated_as_a_mirror(tmp_path):
     polished = KnownBall(roughness=0.2, metallic=1.0, base_color=gold)
-    check(Case(polished, {"roughness": 0.1, "image": 0.04}), tmp_path)
+    check(learn(polished, tmp_path), {"roughness": 0.1, "image": 0.04})
 
 
 @pytest.mark.parametrize(("roughness", "metallic"), [(0.08, 1.0), (0.35, 0.0)])

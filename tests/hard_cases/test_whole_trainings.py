@@ -2,14 +2,17 @@
 
 Geometry starts from the visual hull, and nothing but images, masks and cameras is given: surface, material
 and light are recovered together. The images are made by quadrature or exact distances, apart from the
-package. Bounds are about 1.5 times the larger error of two seeds, at rays of other views.
+package. Bounds are about 1.5 times the error of one seed or the larger error of two, at rays of other views,
+and below the errors of constant answers (`test_degenerate_answers`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -29,9 +32,13 @@ from neilfpp_method.train.run import Run, load_run
 from tests.hard_cases import known_shapes as shapes
 from tests.hard_cases.known_ball import RADIUS, KnownBall, photograph
 from tests.hard_cases.known_capture import Look, look_at_ball, look_at_shape, write_capture
+from tests.hard_cases.material_errors import Answer
+from tests.hard_cases.material_errors import Errors as MaterialErrors
+from tests.hard_cases.material_errors import compare as compare_material
+from tests.hard_cases.shape_errors import Errors as SurfaceErrors
+from tests.hard_cases.shape_errors import compare, rays_on_part
 from tests.hard_cases.test_known_materials import gray
-from tests.hard_cases.test_known_shapes import Errors as SurfaceErrors
-from tests.hard_cases.test_known_shapes import errors as surface_errors
+from tests.hard_cases.test_known_shapes import look
 
 pytestmark = [pytest.mark.hard, pytest.mark.usefixtures("without_shape_checks")]
 
@@ -68,63 +75,34 @@ def trained(
     folder: Path,
     hdr: bool = True,
     changes: Mapping[str, object] | None = None,
+    exposure: bool = False,
     **capture: Any,
 ) -> Run:
     """Write a capture, train it as `neilfpp train` does, and load the run.
 
-    Poses and exposures are not corrected, as `--effects auto` decides here; the evidence for the other
-    effects is not measured, which would take minutes. `capture` are options of `write_capture`.
+    Poses are not corrected, and exposures only if that is asked for, as `--effects auto` decides here; the
+    evidence for the other effects is not measured, which would take minutes. `capture` are options of
+    `write_capture`.
     """
     root = write_capture(folder / "capture", look, hdr=hdr, **capture)
     config = changed(preset("fast"), {**SMALLER, **(changes or {})})
-    effects = EffectRequest("as-set", {"poses": False, "exposure": False})
+    effects = EffectRequest("as-set", {"poses": False, "exposure": exposure})
     request = TrainingRequest(data=root, out=folder / "run", config=config, effects=effects, device="cpu")
     with pytest.MonkeyPatch.context() as patch, computing_fast():
         patch.setattr(review, "PLACES", PLACES)
         return load_run(run_training(request, Console(width=160)))
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Errors at rays of other views.
-
-    Attributes:
-        outline, normal, position: as in `test_known_shapes`.
-        base_color: mean absolute error after the best factor per channel, since the light is not known.
-        roughness, metallic: mean absolute errors.
-        image: mean absolute error of the shaded radiance over the mean radiance.
-        radiance: the same of the volume-rendered radiance.
-    """
-
-    outline: float
-    normal: float
-    position: float
-    base_color: float
-    roughness: float
-    metallic: float
-    image: float
-    radiance: float
-
-
 @torch.no_grad()
-def errors(run: Run, ball: KnownBall) -> Errors:
-    surface = surface_errors(run.model, shapes.photograph(lambda x: shapes.ball(x, RADIUS), 2000, 40, seed=1))
+def errors(run: Run, ball: KnownBall) -> tuple[SurfaceErrors, MaterialErrors]:
+    """Errors at rays of other views. `radiance` is the volume-rendered one."""
+    surface = compare(look(run.model), shapes.photograph(lambda x: shapes.ball(x, RADIUS), 2000, 40, seed=1))
     truth = photograph(ball, HELD_BACK, seed=1)
     rays = RayBatch(*(torch.from_numpy(a).float() for a in (truth.origins, truth.directions)))
-    color, maps = run.model.host.render(rays).color.double().numpy(), run.model.maps(rays)
-    found, wanted = maps.base_color.double().numpy(), ball.base_color(truth.normal)
-    scale = (found * wanted).sum(0) / (found**2).sum(0)
-    mean = truth.color.mean()
-    return Errors(
-        outline=surface.outline,
-        normal=surface.normal,
-        position=surface.position,
-        base_color=float(np.abs(scale * found - wanted).mean()),
-        roughness=float((maps.roughness - ball.roughness).abs().mean()),
-        metallic=float((maps.metallic - ball.metallic).abs().mean()),
-        image=float(np.abs(maps.rgb.double().numpy() - truth.color).mean() / mean),
-        radiance=float(np.abs(color - truth.color).mean() / mean),
-    )
+    color, maps = run.model.host.render(rays).color, run.model.maps(rays)
+    values = (maps.base_color, maps.roughness, maps.metallic, maps.rgb, color)
+    material = compare_material(Answer(*(value.double().numpy() for value in values)), ball, truth)
+    return surface, material
 
 
 # ------------------------------------------------------------------------------------------------------ cases
@@ -132,42 +110,66 @@ def errors(run: Run, ball: KnownBall) -> Errors:
 
 @dataclass(frozen=True)
 class Case:
-    """A training, and the largest errors that it may end with, by name (`Errors`)."""
+    """A training, and the largest errors that it may end with, by name (of surface and material)."""
 
     ball: KnownBall
     bounds: Mapping[str, float]
-    hdr: bool = True
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Options of `trained`."""
 
 
 PAINT = KnownBall()
 MIRROR = KnownBall(roughness=0.08, metallic=1.0, base_color=gray(0.9))
+PAINT_BOUNDS = {
+    "outline": 0.038,
+    "normal": 15.0,
+    "position": 0.04,
+    "scaled_base_color": 0.12,
+    "roughness": 0.065,
+    "metallic": 0.075,
+    "image": 0.13,
+    "radiance": 0.16,
+}
+AWAY = (6e3, 0.0, -8e3)
+"""The centre of a scene 10⁴ radii from the origin of its world, scene units."""
+CLOUD = shapes.photograph(lambda x: shapes.ball(x, RADIUS), 2000, seed=0)
+HALF_STOPS = 2.0 ** (0.5 * (-1.0) ** np.arange(20))
+"""Gains of views that are exposed half a stop too long and too short in turn."""
 CASES = {
-    "paint": Case(
+    "paint": Case(PAINT, PAINT_BOUNDS),
+    "paint, world in units of 1e-4, far away": Case(PAINT, PAINT_BOUNDS, {"unit": 1e4, "away": AWAY}),
+    "paint, world in units of 1e4, far away": Case(PAINT, PAINT_BOUNDS, {"unit": 1e-4, "away": AWAY}),
+    "paint, exposures of ± ½ EV, with a cloud": Case(
+        PAINT,
+        {**PAINT_BOUNDS, "scaled_base_color": 0.13, "roughness": 0.11},
+        {"gains": HALF_STOPS, "exposure": True, "cloud": CLOUD},
+    ),
+    # Without a cloud the gains are not measured before the training (`NOT_RECOVERED`).
+    "paint, exposures of ± ½ EV": Case(
         PAINT,
         {
-            "outline": 0.038,
-            "normal": 15.0,
-            "position": 0.04,
-            "base_color": 0.12,
-            "roughness": 0.065,
-            "metallic": 0.075,
-            "image": 0.13,
-            "radiance": 0.16,
+            "outline": 0.05,
+            "normal": 20.0,
+            "position": 0.048,
+            "metallic": 0.24,
+            "image": 0.33,
+            "radiance": 0.3,
         },
+        {"gains": HALF_STOPS, "exposure": True},
     ),
-    # The roughness is not recovered: the highlight is over-exposed (docs/stability.md).
+    # The roughness is not recovered (`NOT_RECOVERED`): the highlight is over-exposed (docs/stability.md).
     "paint, LDR": Case(
         PAINT,
         {
             "outline": 0.038,
             "normal": 15.0,
             "position": 0.036,
-            "base_color": 0.17,
+            "scaled_base_color": 0.14,
             "metallic": 0.075,
             "image": 0.13,
             "radiance": 0.18,
         },
-        hdr=False,
+        {"hdr": False},
     ),
     # It is recovered as a blurred mirror, a half metal (docs/stability.md).
     "mirror": Case(
@@ -176,14 +178,23 @@ CASES = {
             "outline": 0.042,
             "normal": 12.0,
             "position": 0.035,
-            "base_color": 0.16,
-            "roughness": 0.42,
-            "metallic": 0.63,
+            "scaled_base_color": 0.16,
+            "roughness": 0.38,
+            "metallic": 0.48,
             "image": 0.46,
             "radiance": 0.45,
         },
     ),
 }
+NOT_RECOVERED = [
+    ("paint, exposures of ± ½ EV", "scaled_base_color", 0.12),
+    ("paint, exposures of ± ½ EV", "roughness", 0.1),
+    ("paint, LDR", "roughness", 0.1),
+    ("mirror", "roughness", 0.1),
+    ("mirror", "metallic", 0.2),
+    ("mirror", "image", 0.1),
+]
+"""Bounds that are exceeded, each as large as would be useful."""
 
 
 @dataclass(frozen=True)
@@ -201,8 +212,8 @@ class WithoutOutline:
 
 
 THIN = {
-    "thin plate": SurfaceErrors(outline=0.056, normal=16.0, position=0.03, color=0.0075),
-    "wire": SurfaceErrors(outline=0.26, normal=21.5, position=0.012, color=0.0033),
+    "thin plate": SurfaceErrors(0.056, 16.0, 0.03, 0.0075, missed=0.17, detail=0.015),
+    "wire": SurfaceErrors(0.26, 21.5, 0.0135, 0.0033, missed=0.1, detail=0.013),
 }
 
 WITHOUT_OUTLINE = {
@@ -211,16 +222,35 @@ WITHOUT_OUTLINE = {
 }
 
 
-def check(found: Errors | SurfaceErrors, bounds: Mapping[str, float]) -> None:
-    print(found)  # shown by pytest -rA
+def check(found: Iterable[SurfaceErrors | MaterialErrors], bounds: Mapping[str, float]) -> None:
+    print(*found)  # shown by pytest -rA
+    values = {name: value for errors in found for name, value in asdict(errors).items()}
     for name, bound in bounds.items():
-        assert getattr(found, name) <= bound, f"{name}: {found}"
+        assert values[name] <= bound, f"{name}: {found}"
+
+
+@cache
+def errors_of(name: str) -> tuple[SurfaceErrors, MaterialErrors]:
+    """Train a case, once per process, and measure its errors."""
+    case = CASES[name]
+    with TemporaryDirectory() as folder:
+        return errors(trained(look_at_ball(case.ball), Path(folder), **case.options), case.ball)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_surface_material_and_light_are_recovered_together(tmp_path, name):
-    case = CASES[name]
-    check(errors(trained(look_at_ball(case.ball), tmp_path, case.hdr), case.ball), case.bounds)
+def test_surface_material_and_light_are_recovered_together(name):
+    check(errors_of(name), CASES[name].bounds)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="an over-exposed highlight hides the roughness, a mirror under an unknown light is found as a "
+    "blurred half metal, and gains that are not measured at a cloud are hardly learned (docs/stability.md)",
+)
+@pytest.mark.parametrize(("name", "measure", "bound"), NOT_RECOVERED)
+def test_values_that_are_not_recovered(name, measure, bound):
+    check(errors_of(name), {measure: bound})
 
 
 @pytest.mark.parametrize("name", THIN)
@@ -228,7 +258,19 @@ def test_a_thin_shape_is_recovered_from_its_hull(tmp_path, name):
     shape = shapes.SHAPES[name]
     run = trained(look_at_shape(shape), tmp_path, changes=SURFACE_ONLY)
     truth = shapes.photograph(shape, 2000, views=40, seed=1)
-    check(surface_errors(run.model, truth), asdict(THIN[name]))
+    check([compare(look(run.model), truth, rays_on_part(name))], asdict(THIN[name]))
+
+
+@pytest.mark.xfail(
+    strict=True,
+    raises=AssertionError,
+    reason="the hull of a bowl is solid, and its inside is not carved out (docs/stability.md)",
+)
+def test_the_inside_of_a_bowl_is_recovered_from_its_hull(tmp_path):
+    run = trained(look_at_shape(shapes.bowl), tmp_path, changes={**SURFACE_ONLY, "train.sdf_steps": 1600})
+    truth = shapes.photograph(shapes.bowl, 2000, views=40, seed=1)
+    found = compare(look(run.model), truth, rays_on_part("concave bowl"))
+    check([found], {"missed": 0.05, "detail": 0.08})
 
 
 @pytest.mark.parametrize("name", WITHOUT_OUTLINE)
@@ -236,6 +278,6 @@ def test_a_shape_that_fills_every_image_is_recovered_with_its_cloud(tmp_path, na
     shape, case = shapes.SHAPES[name], WITHOUT_OUTLINE[name]
     cloud = shapes.photograph(shape, 2000, seed=0, **case.camera)
     changes = {**SURFACE_ONLY, "loss.point_cloud": 1.0}
-    run = trained(look_at_shape(shape), tmp_path, changes=changes, cloud=cloud, **case.camera)
+    run = trained(look_at_shape(shape), tmp_path, changes=changes, cloud=cloud, masks=False, **case.camera)
     truth = shapes.photograph(shape, 2000, seed=1, **{**case.camera, "views": 40})
-    check(surface_errors(run.model, truth), asdict(case.largest))
+    check([compare(look(run.model), truth)], asdict(case.largest))
