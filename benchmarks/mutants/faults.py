@@ -3,29 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-__all__ = ["MUTANTS", "Mutant"]
+from benchmarks.mutants.later_faults import LATER_FAULTS
+from benchmarks.mutants.mutant import Mutant
 
-
-@dataclass(frozen=True)
-class Mutant:
-    """A fault in a module of the package.
-
-    Attributes:
-        what: the fault in a few words.
-        module: path of the module below the package.
-        old: the code that the fault replaces; it occurs exactly once in the module.
-        new: the code with the fault.
-        tests: path below `tests` of the tests that should notice it.
-    """
-
-    what: str
-    module: str
-    old: str
-    new: str
-    tests: str
-
+__all__ = ["MUTANTS"]
 
 BRDF, SAMPLING = "shading/brdf.py", "shading/sampling.py"
 MUTANTS: Sequence[Mutant] = (
@@ -283,7 +265,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "shadow rays to lamps are ignored",
         "incident/arriving.py",
-        "radiance * visibility[..., None]",
+        "radiance * rays.visibility(x, sources.scene)[..., None]",
         "radiance * 1.0",
         "incident/test_arriving.py",
     ),
@@ -401,4 +383,5 @@ MUTANTS: Sequence[Mutant] = (
         "0",
         "train/test_start.py",
     ),
+    *LATER_FAULTS,
 )

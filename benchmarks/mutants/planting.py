@@ -16,7 +16,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.mutants.faults import Mutant
+from benchmarks.mutants.mutant import Mutant
 
 __all__ = ["ROOT", "Outcome", "planted", "try_all"]
 

@@ -21,6 +21,7 @@ from PIL import Image
 
 from neilfpp_method.data.files.atomic_file import replacing
 from neilfpp_method.data.files.exr import exr_header, exr_samples
+from neilfpp_method.data.files.exr_chunks import has_all_chunks
 from neilfpp_method.data.files.image_parts import ImageHeader, rgb_of_opencv
 from neilfpp_method.data.files.png import check_png_chunks
 from neilfpp_method.data.files.radiance_hdr import hdr_header, hdr_samples
@@ -41,7 +42,7 @@ MAX_SIDE = 65_536
 """Longest side of an image, in pixels."""
 MAX_PIXELS = 2**30
 """Largest number of pixels of an image; bounds the memory."""
-LABEL = 1.001 / 255
+MAX_LABEL = 1.001 / 255
 """Largest value of a mask file, in [0, 1], at which it contains labels instead of brightness: 1 of 255."""
 SIGNATURES = {b"\x89PNG": ".png", b"\xff\xd8\xff": ".jpg"}
 """First bytes of PNG and JPEG files, which are recognised by them, because renamed files are common."""
@@ -72,7 +73,7 @@ class ImageFile:
         Segmentation tools write the labels 0 and 1; a file whose largest value is 1 of 255 is read as such.
         """
         values = self.pixels.max(axis=-1) if self.alpha is None else self.alpha
-        return (values > 0).astype(np.float32) if 0 < values.max() <= LABEL else values
+        return (values > 0).astype(np.float32) if 0 < values.max() <= MAX_LABEL else values
 
 
 # --------------------------------------------------------------------------------------------- kinds of files
@@ -251,6 +252,9 @@ def write_exr(path: Path, channels: Mapping[str, Shaped[np.ndarray, "H W ..."]])
         except RuntimeError as error:
             # OpenEXR reports a full disk as a RuntimeError.
             raise OSError(" ".join(str(error).split()).rstrip(".")) from error
+        # It does not report that the last rows are missing.
+        if not has_all_chunks(temporary):
+            raise OSError("pixels are missing")
 
 
 def write_png(path: Path, samples: Shaped[np.ndarray, "H W ..."]) -> None:

@@ -4,7 +4,8 @@
 
 This process loads the package once; every command runs in a copy of it (`fork`). REPORT has the number of
 kills by command and signal, and every fault: a traceback, an unexpected exit status, a file under its final
-name that cannot be read, or a result that is not bit for bit that of an uninterrupted command.
+name that cannot be read, or a result that is not bit for bit that of an uninterrupted command. The times that
+`relight` records are the only difference that is permitted.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import sys
 import time
@@ -21,17 +23,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import torch
-import trimesh
 
 from neilfpp_method.cli import main as neilfpp
-from neilfpp_method.data.files.images import read_image, write_exr
-from neilfpp_method.errors import UserError
+from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.prepare.layout import WORK
 from neilfpp_method.settings.presets import PRESETS
-from neilfpp_method.train.checkpoint import last_checkpoint, load_checkpoint
+from neilfpp_method.train.checkpoint import last_checkpoint
 from tests.data.make_capture import make_capture
+from tests.hard_cases.faults.whole_files import check_whole, comparable_files, visible_files
 from tests.prepare.textured_corner import make_photos
 from tests.train.small_runs import differences, small_config
 
@@ -103,25 +103,11 @@ def check_end(report: Report, what: str, ended: Ended) -> None:
 
 
 def check_files(report: Report, what: str, folder: Path) -> None:
-    """Check that every file under its final name is complete. Files that are being written have hidden
-    names.
-    """
-    for path in folder.rglob("*"):
-        if path.name.startswith(".") or not path.is_file():
-            continue
+    """Check that every file under its final name is complete."""
+    for path in visible_files(folder):
         report.files += 1
-        try:
-            if path.suffix == ".pt":
-                load_checkpoint(path)
-            elif path.suffix == ".json":
-                json.loads(path.read_text())
-            elif path.suffix == ".png":
-                read_image(path)
-            elif path.suffix == ".exr":  # several layers: a capture cannot contain such an image
-                OpenEXR.File(str(path))
-            elif path.suffix in (".ply", ".glb", ".obj"):
-                trimesh.load(path)
-        except (UserError, ValueError, RuntimeError) as error:
+        error = check_whole(path)
+        if error is not None:
             report.faults.append(f"{what}: {path.name} is not whole: {error}")
 
 
@@ -160,34 +146,70 @@ def attack_training(report: Report, folder: Path, draw: random.Random, kills: in
     return whole
 
 
-SKY = "sky.exr"
-"""An environment map, in the folder of the campaign."""
+SKY, RUN, OTHER = "SKY", "RUN", "OTHER"
+"""In the words of a command: an environment map, a finished run, and a copy of it."""
 COMMANDS = (
-    ("eval",),
-    ("render", "--overwrite"),
-    ("export", "--what", "mesh", "light", "--resolution", "32"),
-    ("relight", "--spp", "2", "--force", "--env", SKY),
-    ("report",),
+    ("eval", RUN),
+    ("render", RUN, "--overwrite"),
+    ("export", RUN, "--what", "mesh", "light", "--resolution", "32"),
+    ("export", RUN, "--what", "asset", "--resolution", "32", "--texture-size", "64", "--faces", "400"),
+    ("relight", RUN, "--spp", "2", "--force", "--resolution", "32", "--env", SKY),
+    (
+        *("relight", RUN, "--spp", "2", "--force", "--resolution", "32", "--out", f"{RUN}/turned"),
+        *("--views", "turntable", "--frames", "3", "--env", SKY),
+    ),
+    ("report", RUN),
+    ("compare", RUN, OTHER, "--out", f"{RUN}/compared"),
 )
 """Commands that read a run and write into its folder."""
 
 
-def attack_command(report: Report, folder: Path, words: list[str], draw: random.Random, kills: int) -> None:
-    """Kill a command that reads a run, then let it finish; the run must stay intact throughout."""
+def attack_command(
+    report: Report, run_folder: Path, words: list[str], draw: random.Random, kills: int
+) -> None:
+    """Kill a command that reads a run, up to three times, and let it finish, over and over.
+
+    After a kill, a file under its final name is that of before the command or that of an uninterrupted
+    command, byte for byte. After the command has finished, all files are those of an uninterrupted one.
+    """
+    folder, before = run_folder.parent, comparable_files(run_folder)
+    shutil.copytree(run_folder, original := folder / "original")
     whole = run(folder, *words)
     if whole.status:
         report.faults.append(f"{words[0]}: cannot be run: {whole.said[-800:]}")
+        shutil.rmtree(original)
         return
-    for _ in range(kills):
-        kill = draw.choice(SIGNALS)
-        what = f"{words[0]}, {kill.name}"
-        ended = run(folder, *words, kill=kill, after=draw.uniform(0.0, whole.seconds))
-        report.kills[what] += 1
-        check_end(report, what, ended)
-        check_files(report, what, Path(words[1]))
-    ended = run(folder, *words)
-    if ended.status:
-        report.faults.append(f"{words[0]} after kills: status {ended.status}: {ended.said[-800:]}")
+    wanted, done = comparable_files(run_folder), 0
+    while done < kills:
+        if draw.random() < 0.7:  # else the command writes over its own files
+            shutil.rmtree(run_folder)
+            shutil.copytree(original, run_folder)
+        for _ in range(min(draw.randint(1, 3), kills - done)):
+            kill = draw.choice(SIGNALS)
+            what, done = f"{words[0]}, {kill.name}", done + 1
+            ended = run(folder, *words, kill=kill, after=draw.uniform(0.0, whole.seconds))
+            report.kills[what] += 1
+            check_end(report, what, ended)
+            check_files(report, what, run_folder)
+            report.faults += [
+                f"{what}: {name} is neither that of before nor that of an uninterrupted command"
+                for name, content in comparable_files(run_folder).items()
+                if content not in (before.get(name), wanted.get(name))
+            ]
+        ended = run(folder, *words)
+        if ended.status:
+            report.faults.append(f"{words[0]} after kills: status {ended.status}: {ended.said[-800:]}")
+        compare_files(report, f"{words[0]} after kills", comparable_files(run_folder), wanted)
+    shutil.rmtree(original)
+
+
+def compare_files(report: Report, what: str, found: dict[str, bytes], wanted: dict[str, bytes]) -> None:
+    """Check that a command that was killed and repeated has left the files of an uninterrupted one."""
+    report.faults += [
+        f"{what}: {name} is not that of a command that was never interrupted"
+        for name in sorted(wanted.keys() | found.keys())
+        if wanted.get(name) != found.get(name)
+    ]
 
 
 def attack_prepare(report: Report, folder: Path, draw: random.Random, kills: int) -> None:
@@ -219,22 +241,12 @@ def attack_prepare(report: Report, folder: Path, draw: random.Random, kills: int
         if ended.status:
             report.faults.append(f"prepare goes on: status {ended.status}: {ended.said[-800:]}")
             continue
-        found = capture_files(out)
-        report.faults += [
-            f"prepare: {name} is not that of a capture that was never interrupted"
-            for name in sorted(wanted.keys() | found.keys())
-            if wanted.get(name) != found.get(name)
-        ]
+        compare_files(report, "prepare after kills", capture_files(out), wanted)
 
 
 def capture_files(out: Path) -> dict[str, bytes]:
     """The files of a prepared capture by name, without the work of its steps and unfinished files."""
-    inside = (path.relative_to(out) for path in out.rglob("*") if path.is_file())
-    return {
-        str(path): (out / path).read_bytes()
-        for path in inside
-        if path.parts[0] != WORK and not path.name.startswith(".")
-    }
+    return {name: content for name, content in comparable_files(out).items() if Path(name).parts[0] != WORK}
 
 
 def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
@@ -242,11 +254,14 @@ def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     draw, report = random.Random(seed), Report()
     make_capture(folder / "capture", masks=True)
     whole = attack_training(report, folder, draw, kills)
-    write_exr(folder / SKY, {"RGB": np.full((8, 16, 3), 0.5, np.float32)})
+    sky, other = folder / "sky.exr", folder / "other"
+    write_exr(sky, {"RGB": np.full((8, 16, 3), 0.5, np.float32)})
+    shutil.copytree(whole, other)
     each = kills // 10
-    for name, *options in COMMANDS if each else ():
-        words = [str(folder / SKY) if option == SKY else option for option in options]
-        attack_command(report, folder, [name, str(whole), *words], draw, each)
+    for command in COMMANDS if each else ():
+        places = {SKY: str(sky), RUN: str(whole), OTHER: str(other)}
+        words = [places.get(word, word.replace(RUN, str(whole))) for word in command]
+        attack_command(report, whole, words, draw, each)
     if each:
         attack_prepare(report, folder, draw, each)
     told = {"kills": dict(report.kills), "files": report.files, "faults": report.faults}

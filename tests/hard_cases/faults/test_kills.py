@@ -19,7 +19,7 @@ from tests.data.make_capture import make_capture
 
 REPOSITORY = Path(__file__).parents[3]
 KILLS = int(os.environ.get("HARD_KILLS", "150"))
-"""Kills of trainings in the long campaign; a tenth of it for each of six other commands."""
+"""Kills of trainings in the long campaign; a tenth of it for each of nine other commands."""
 
 
 def attack(folder: Path, seed: int, kills: int) -> dict:

@@ -1,0 +1,104 @@
+"""Faults of relighting, files, health and attached hosts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from benchmarks.mutants.mutant import Mutant
+
+__all__ = ["LATER_FAULTS"]
+
+TRACER, SCATTERING = "relight/path_tracer.py", "relight/scattering.py"
+LATER_FAULTS: Sequence[Mutant] = (
+    Mutant(
+        "a direction of the BRDF has the weight of light sampling",
+        TRACER,
+        "power_heuristic(pdf, scene.sky.pdf(wi))",
+        "power_heuristic(scene.sky.pdf(wi), pdf)",
+        "relight/test_path_tracer.py",
+    ),
+    Mutant(
+        "shadow rays to the lamps of the path tracer are ignored",
+        TRACER,
+        "~scene.surface.blocked(origins[rows], wi, sample.distance[rows])",
+        "torch.ones_like(pdf)",
+        "relight/test_path_tracer.py",
+    ),
+    Mutant(
+        "density of the path tracer without the share of the cosine",
+        SCATTERING,
+        "(1 - at.share) * pdf_cosine(",
+        "pdf_cosine(",
+        "relight/test_scattering.py",
+    ),
+    Mutant(
+        "the path tracer forgets the cosine",
+        SCATTERING,
+        "[:, 0] * cosine * above",
+        "[:, 0] * above",
+        "relight/test_scattering.py",
+    ),
+    Mutant(
+        "density of the map of the path tracer without solid angles",
+        "relight/sky.py",
+        "self._mass.sum() / self._solid_angles[:, None])",
+        "self._mass.sum())",
+        "relight/test_sky.py",
+    ),
+    Mutant(
+        "a movie without all of its frames is accepted",
+        "relight/movie.py",
+        "if written != len(pictures):",
+        "if False:",
+        "relight/test_movie_on_full_disk.py",
+    ),
+    Mutant(
+        "an EXR file without its last rows is accepted",
+        "data/files/images.py",
+        "if not has_all_chunks(temporary):",
+        "if False:",
+        "data/files/test_exr_chunks.py",
+    ),
+    Mutant(
+        "checkpoints of other versions are accepted",
+        "train/checkpoint.py",
+        'contents.get("format") != FORMAT or ',
+        "",
+        "train/test_checkpoint_version.py",
+    ),
+    Mutant(
+        "steps of an attached host that are not finite are taken",
+        "health/guard.py",
+        "if not self._is_finite:",
+        "if False:",
+        "health/test_guard.py",
+    ),
+    Mutant(
+        "skipped steps need not be consecutive to end a training",
+        "health/guard.py",
+        "            self._in_a_row = 0\n            return True",
+        "            return True",
+        "health/test_guard.py",
+    ),
+    Mutant(
+        "a finding remains when it is no longer found",
+        "health/watch.py",
+        "self.findings.pop(case.name) for",
+        "self.findings[case.name] for",
+        "health/test_watch.py",
+    ),
+    Mutant(
+        "steps without surface points are not counted",
+        "health/watch.py",
+        "else self.empty_steps + 1",
+        "else 0",
+        "health/test_watch.py",
+    ),
+    Mutant(
+        "the optimizer of an attached host is not watched",
+        "attach.py",
+        "self.step_guard.watch(optimizer)",
+        "pass",
+        "test_attach_health.py",
+    ),
+)
