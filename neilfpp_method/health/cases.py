@@ -10,19 +10,23 @@ its absence does not prove that the result is good.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from neilfpp_method.health.measure import SurfaceMeasurement
+from neilfpp_method.health.measure import HeldBack, SurfaceMeasurement
 
 __all__ = [
+    "BETA_STUCK",
     "FEW_LIGHT_POINTS",
     "FOG",
     "MATERIAL_AT_BOUNDS",
+    "METALLIC_AT_BOUND",
     "NOTHING_SHADED",
     "NO_SURFACE",
     "OFF_CLOUD",
+    "ROUGHNESS_AT_BOUND",
     "SKIPPED_STEPS",
+    "WORSE_THAN_CONSTANT",
     "Case",
     "Finding",
     "Health",
@@ -33,6 +37,7 @@ __all__ = [
     "skipped_steps",
     "surface_findings",
     "verdict_of",
+    "worse_than_constant",
 ]
 
 Verdict = Literal["sound", "doubtful", "failed"]
@@ -43,14 +48,28 @@ MIN_SHARP = 0.5
 """Minimum share of the opaque rays that hit a single surface. In fog the weights of a ray are spread out, so
 only few rays do.
 """
+MAX_WIDTH = 0.025
+"""Largest β at which a surface can be sharp, scene units. Above it, rays that meet a ball head-on have less
+than 0.8 of their weight near one point, so they are not hits (`shading.hit_share`).
+"""
 MAX_AT_BOUND = 0.2
 """Maximum share of the surface whose base colour is black or white. Runs with a light of the right scale had
 at most 9 %, a dark statue under a light that was 25 times too dim 42 %.
+"""
+MIN_PARKED = 0.95
+"""Share of the surface from which a parameter at its bound says nothing about the object. In eleven runs that
+are not wrong at most 24 % had a roughness of 0 or 1, and 17 % a metallic of 1.
+"""
+MAX_POOR_PSNR = 20.0
+"""PSNR in dB, an error of a tenth, from which a rendering is no finding: an object of one colour is nearly a
+constant. Eleven runs were 5 to 16 dB better than the best constant, and two of the dark statue 2 and 5 dB.
 """
 MAX_OFF_CLOUD = 0.2
 """Largest median distance between the surface and the point cloud that supervises it, in scene units. It was
 0.01 to 0.04 in captures of objects, a castle and a table, and 0.5 to 0.6 with a shell in front of the object.
 """
+MIN_HELD_BACK = 100
+"""Number of held-back pixels below which they are not compared with one colour: a few patches resemble it."""
 MAX_EMPTY_STEPS = 50
 """Number of consecutive steps of a material stage without a surface point that is a finding."""
 MIN_LIGHT_POINTS = 100
@@ -114,9 +133,16 @@ FOG = Case(
     remedy="check the scene box (`neilfpp inspect` draws that of a capture), give masks, or train the "
     "geometry for more steps (train.sdf_steps)",
 )
+BETA_STUCK = Case(
+    name="beta_stuck",
+    severe=True,
+    cause="a width β that is only learned, and photographs that fog explains well enough",
+    remedy="bound it (volume.beta_final to 0.002), raise its learning rate (optimizer.beta), or start lower "
+    "(volume.beta_init)",
+)
 OFF_CLOUD = Case(
     name="off_point_cloud",
-    severe=False,
+    severe=True,
     cause="views that overlap so little that a shell in front of the object explains them as well",
     remedy="raise the weight of the cloud (loss.point_cloud to 1) or take more images; if the cloud is "
     "wrong, leave it out (loss.point_cloud 0)",
@@ -140,6 +166,24 @@ MATERIAL_AT_BOUNDS = Case(
     cause="a light with a wrong scale",
     remedy="give a known environment map (light.map, in `neilfpp train` --light), or read docs/light.md",
 )
+ROUGHNESS_AT_BOUND = Case(
+    name="roughness_at_bound",
+    severe=False,
+    cause="too few directions per point for a mirror (0), or images or a light without highlights (1)",
+    remedy="for 0 raise shading.train_samples; for 1 give a known light (light.map) or lower loss.lambertian",
+)
+METALLIC_AT_BOUND = Case(
+    name="metallic_at_bound",
+    severe=False,
+    cause="paint that is taken for metal, unless all of the object is metal",
+    remedy="if it is not, switch metals off (brdf.metals False, in `neilfpp train` --effects auto,-metals)",
+)
+WORSE_THAN_CONSTANT = Case(
+    name="worse_than_constant",
+    severe=True,
+    cause="a light with a wrong scale or from a wrong direction, or a surface that is not that of the object",
+    remedy="compare the previews of SDF init and of material; check a given light, or read docs/light.md",
+)
 SKIPPED_STEPS = Case(
     name="skipped_steps",
     severe=False,
@@ -153,10 +197,17 @@ SKIPPED_STEPS = Case(
 
 
 def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
-    """Find `NO_SURFACE`, `FOG` or `OFF_CLOUD`, at the end of a stage that trains the surface or later."""
+    """Find `NO_SURFACE`, `BETA_STUCK`, `FOG` or `OFF_CLOUD`, when a surface should have formed.
+
+    If β alone makes fog of any surface, the finding is `BETA_STUCK`, because the remedies of `FOG` do not
+    help.
+    """
     if measured.opaque < MIN_OPAQUE:
         what = f"only {measured.opaque:.0%} of the object's pixels show a surface"
         return [NO_SURFACE.found(step, what)]
+    if measured.sharp < MIN_SHARP and measured.width is not None and measured.width > MAX_WIDTH:
+        what = f"the surface has not become sharp: its width β is still {measured.width:.2g} scene units"
+        return [BETA_STUCK.found(step, what)]
     if measured.sharp < MIN_SHARP:
         what = f"only {measured.sharp:.0%} of the rays that show something meet one surface: the scene is fog"
         return [FOG.found(step, what)]
@@ -167,11 +218,29 @@ def surface_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
 
 
 def material_findings(measured: SurfaceMeasurement, step: int) -> list[Finding]:
-    """Find `MATERIAL_AT_BOUNDS`."""
-    if measured.at_bound is None or measured.at_bound <= MAX_AT_BOUND:
+    """Find `MATERIAL_AT_BOUNDS`, `ROUGHNESS_AT_BOUND` and `METALLIC_AT_BOUND`."""
+    findings = []
+    if measured.at_bound is not None and measured.at_bound > MAX_AT_BOUND:
+        what = f"the base colour of {measured.at_bound:.0%} of the surface is black or white"
+        case = replace(MATERIAL_AT_BOUNDS, severe=measured.at_bound >= MIN_PARKED)
+        findings.append(case.found(step, what))
+    for parameter, share in measured.parked.items():
+        if share >= MIN_PARKED:
+            case = METALLIC_AT_BOUND if parameter.startswith("metallic") else ROUGHNESS_AT_BOUND
+            findings.append(case.found(step, f"{share:.0%} of the surface has {parameter}"))
+    return findings
+
+
+def worse_than_constant(held_back: HeldBack, step: int) -> list[Finding]:
+    """Find `WORSE_THAN_CONSTANT`, at the end of a stage that trains material."""
+    is_fair = held_back.physical is None or held_back.physical >= min(held_back.constant, MAX_POOR_PSNR)
+    if is_fair or len(held_back.hits) < MIN_HELD_BACK:
         return []
-    what = f"the base colour of {measured.at_bound:.0%} of the surface is black or white"
-    return [MATERIAL_AT_BOUNDS.found(step, what)]
+    what = (
+        f"material and light explain held-back pixels ({held_back.physical:.1f} dB) worse than one colour "
+        f"for all of them ({held_back.constant:.1f} dB)"
+    )
+    return [WORSE_THAN_CONSTANT.found(step, what)]
 
 
 def nothing_shaded(steps: int, step: int) -> list[Finding]:
@@ -224,6 +293,11 @@ class Health:
         """The health that follows from findings."""
         all_findings = tuple(findings)
         return Health(verdict_of(all_findings), all_findings)
+
+    @property
+    def failure(self) -> Finding | None:
+        """The first finding that makes the result unusable; None if there is none."""
+        return next((finding for finding in self.findings if finding.severe), None)
 
     def __str__(self) -> str:
         return self.verdict + (": " + "; ".join(f.what for f in self.findings) if self.findings else "")

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.hosts.base import HasPointCloud, Host
+from neilfpp_method.hosts.base import HasPointCloud, HasSurfaceWidth, Host
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, OrientedPoints, PixelBatch, SurfaceHits
 
-__all__ = ["SurfaceMeasurement", "measure_hits", "measure_surface"]
+__all__ = ["HeldBack", "SurfaceMeasurement", "measure_hits", "measure_surface"]
 
 CLOUD_POINTS = 20_000
 """Maximum number of points of the cloud with which a surface is compared."""
 OPAQUE = 0.5
 """Opacity above which a ray counts as opaque."""
 AT_BOUND = 0.02
-"""Distance from 0 or 1 within which a channel of base colour counts as at its bound."""
+"""Distance from 0 or 1 within which a parameter of the material counts as at its bound."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,9 @@ class SurfaceMeasurement:
             channel; None without a material.
         off_cloud: median distance of the surface points from the point cloud that supervises the surface,
             scene units; None without a cloud or surface points.
+        width: width of the soft layer that the surface is (β), scene units; None if the host has none.
+        parked: share of the surface points at "roughness 0", "roughness 1" and "metallic 1"; empty without a
+            specular material. A metallic of 0 is right for every object without metal.
     """
 
     rays: int
@@ -41,6 +46,23 @@ class SurfaceMeasurement:
     sharp: float
     at_bound: float | None
     off_cloud: float | None = None
+    width: float | None = None
+    parked: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class HeldBack:
+    """What a training measures at the pixels that no step uses.
+
+    Attributes:
+        hits: what the host rendered there.
+        physical: PSNR of the PBR rendering, dB; None before there is a material.
+        constant: PSNR of the one colour that is closest to all these pixels, dB.
+    """
+
+    hits: SurfaceHits
+    physical: float | None
+    constant: float
 
 
 @torch.no_grad()
@@ -62,11 +84,15 @@ def measure_hits(model: NeilfModel, hits: SurfaceHits, with_material: bool) -> S
     """The same as `measure_surface`, for pixels on the object that the host has already rendered."""
     opaque = hits.opacity > OPAQUE
     sharp = opaque & hits.is_hit(model.config.shading.hit_share)
-    at_bound = None
+    at_bound, parked = None, {}
     if with_material and sharp.any():
-        at_bound = _share_at_bound(model.materials(hits.position[sharp]))
+        material = model.materials(hits.position[sharp])
+        at_bound, parked = _share_at_bound(material), _shares_parked(material, model.config)
     off_cloud = _off_cloud(model.host, hits.position[sharp])
-    return SurfaceMeasurement(len(hits), _share(opaque), _share(sharp[opaque]), at_bound, off_cloud)
+    width = float(model.host.surface_width()) if isinstance(model.host, HasSurfaceWidth) else None
+    return SurfaceMeasurement(
+        len(hits), _share(opaque), _share(sharp[opaque]), at_bound, off_cloud, width, parked
+    )
 
 
 def _share(flags: torch.Tensor) -> float:
@@ -84,4 +110,15 @@ def _off_cloud(host: Host, position: Float[Tensor, "N 3"]) -> float | None:
 
 def _share_at_bound(material: Material) -> float:
     color = material.base_color
-    return ((color < AT_BOUND) | (color > 1 - AT_BOUND)).all(-1).float().mean().item()
+    return _share(((color < AT_BOUND) | (color > 1 - AT_BOUND)).all(-1))
+
+
+def _shares_parked(material: Material, config: NeilfConfig) -> dict[str, float]:
+    if not config.shading.specular:
+        return {}
+    flags = {
+        "roughness 0": material.roughness < AT_BOUND,
+        "roughness 1": material.roughness > 1 - AT_BOUND,
+        "metallic 1": material.metallic > 1 - AT_BOUND,
+    }
+    return {name: _share(at_bound) for name, at_bound in flags.items()}

@@ -186,7 +186,9 @@ def _keep_pace(run: Training, position: StagePosition, step: int) -> int:
 @timed("checks", undivided=True)
 def _check_quality(run: Training, position: StagePosition, step: int) -> None:
     if run.fabric.is_global_zero:
-        run.quality.check_when_due(run.model, position, step, run.ledger.total)
+        held_back = run.quality.check_when_due(run.model, position, step, run.ledger.total)
+        if held_back is not None:
+            run.watch.after_check(run.model, position, held_back, step)
 
 
 @timed("optimizer")

@@ -22,10 +22,11 @@ from torch import Tensor
 
 from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.errors import UserError
+from neilfpp_method.health.measure import HeldBack
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePosition
 from neilfpp_method.shading.color import display_values, tone_map
-from neilfpp_method.structures import PixelBatch
+from neilfpp_method.structures import Maps, PixelBatch, SurfaceHits
 from neilfpp_method.train.json_files import is_finite_number, read_entries
 
 __all__ = ["FILE", "Quality", "QualityCheck", "has_checks", "read_checks", "write_checks"]
@@ -73,7 +74,9 @@ class Quality:
     pixels: PixelBatch
     checks: list[QualityCheck] = field(default_factory=list)
 
-    def check_when_due(self, model: NeilfModel, position: StagePosition, step: int, seconds: float) -> None:
+    def check_when_due(
+        self, model: NeilfModel, position: StagePosition, step: int, seconds: float
+    ) -> HeldBack | None:
         """Measure the quality if a measurement is due.
 
         Args:
@@ -81,16 +84,24 @@ class Quality:
             position: the stage, the number of its steps trained so far, and its length.
             step: number of steps trained so far in all stages.
             seconds: time of the run so far.
+
+        Returns:
+            What was measured, for the health checks; None without a measurement, or if it is not finite.
         """
         if not len(self.pixels) or not self._due(position, step, seconds):
-            return
+            return None
         began = time.perf_counter()
-        psnr = _measure(model, self.pixels, model.stages[position.stage].trains_material)
+        with torch.no_grad(), model.evaluating():
+            hits = model.host.render(self.pixels.rays)
+            psnr = _measure(model, self.pixels, hits, model.stages[position.stage].trains_material)
         took = time.perf_counter() - began
         # A model that is not finite is reported by `health`.
-        if math.isfinite(psnr.radiance) and math.isfinite(psnr.physical or 0.0):
-            stage = position.stage.value
-            self.checks.append(QualityCheck(step, stage, seconds, psnr.radiance, psnr.physical, took))
+        if not (math.isfinite(psnr.radiance) and math.isfinite(psnr.physical or 0.0)):
+            return None
+        stage = position.stage.value
+        self.checks.append(QualityCheck(step, stage, seconds, psnr.radiance, psnr.physical, took))
+        shown = display_values(self.pixels.color, model.facts.response)
+        return HeldBack(hits, psnr.physical, _psnr(shown.mean(0).expand_as(shown), shown))
 
     def _due(self, position: StagePosition, step: int, seconds: float) -> bool:
         if position.step == position.length:
@@ -109,10 +120,8 @@ class _Measured:
     physical: float | None
 
 
-@torch.no_grad()
-def _measure(model: NeilfModel, pixels: PixelBatch, with_material: bool) -> _Measured:
-    with model.evaluating():
-        maps = model.maps(pixels.rays) if with_material else model.host_maps(pixels.rays)
+def _measure(model: NeilfModel, pixels: PixelBatch, hits: SurfaceHits, with_material: bool) -> _Measured:
+    maps = model.maps(pixels.rays, hits) if with_material else Maps.of_host(pixels.rays, hits)
     photograph = display_values(pixels.color, model.facts.response)
     physical = _psnr(tone_map(maps.rgb), photograph) if with_material else None
     return _Measured(_psnr(tone_map(maps.rgb_volume), photograph), physical)

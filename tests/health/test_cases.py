@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 
 from neilfpp_method.health.cases import (
+    MAX_AT_BOUND,
+    MIN_PARKED,
+    Health,
     few_light_points,
     material_findings,
     nothing_shaded,
@@ -38,9 +41,34 @@ def test_a_surface_far_from_its_point_cloud_is_a_finding(off, found):
     assert cases(surface_findings(SurfaceMeasurement(100, 1.0, 1.0, None, off), 7)) == found
 
 
-@pytest.mark.parametrize(("share", "found"), [(None, []), (0.1, []), (0.4, ["material_at_bounds"])])
-def test_a_material_at_its_bounds_is_a_finding(share, found):
-    assert cases(material_findings(SurfaceMeasurement(100, 1.0, 1.0, share), 7)) == found
+@pytest.mark.parametrize(("width", "found"), [(None, "fog"), (0.01, "fog"), (0.06, "beta_stuck")])
+def test_fog_is_reported_once_and_blames_a_width_with_which_no_surface_is_sharp(width, found):
+    assert cases(surface_findings(SurfaceMeasurement(100, 1.0, 0.1, None, width=width), 7)) == [found]
+    assert cases(surface_findings(SurfaceMeasurement(100, 1.0, 0.9, None, width=width), 7)) == []
+
+
+@pytest.mark.parametrize(
+    ("share", "severe"),
+    [(None, []), (0.1, []), (MAX_AT_BOUND + 0.01, [False]), (MIN_PARKED - 0.01, [False]), (0.97, [True])],
+)
+def test_a_base_color_at_its_bounds_is_a_finding(share, severe):
+    findings = material_findings(SurfaceMeasurement(100, 1.0, 1.0, share), 7)
+    assert cases(findings) == ["material_at_bounds"] * len(severe)
+    assert [finding.severe for finding in findings] == severe
+
+
+@pytest.mark.parametrize(
+    ("parked", "found"),
+    [
+        ({"roughness 0": 0.9, "roughness 1": 0.05, "metallic 1": 0.9}, []),
+        ({"roughness 0": 0.97, "roughness 1": 0.0}, ["roughness_at_bound"]),
+        ({"roughness 1": 0.97, "metallic 1": 0.96}, ["roughness_at_bound", "metallic_at_bound"]),
+    ],
+)
+def test_a_parameter_that_is_at_a_bound_nearly_everywhere_is_a_finding(parked, found):
+    findings = material_findings(SurfaceMeasurement(100, 1.0, 1.0, 0.0, parked=parked), 7)
+    assert cases(findings) == found
+    assert verdict_of(findings) == ("doubtful" if found else "sound")
 
 
 @pytest.mark.parametrize(
@@ -65,3 +93,5 @@ def test_the_verdict_is_the_worst_finding():
     assert verdict_of([]) == "sound"
     assert verdict_of(doubt) == "doubtful"
     assert verdict_of(doubt + fog) == "failed"
+    assert Health.of(doubt).failure is None
+    assert Health.of(doubt + fog).failure == fog[0]

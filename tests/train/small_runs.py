@@ -108,7 +108,7 @@ def small_training(root: Path, out: Path, config: NeilfConfig, patches: int = PA
         preview=lambda model, capture, stage: None,
         continue_with="",
         light_solver=model.light_solver(),
-        watch=Watch(pixels.sample(64), listener.warn),
+        watch=Watch(pixels.sample(64), listener.warn, listener.say),
         plan=Plan.begin(EffectRequest("as-set"), config),
         quality=Quality(hold_back(pixels, config.train.seed, patches)),
     )
