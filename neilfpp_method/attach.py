@@ -10,9 +10,8 @@ It takes three lines, the last of them in every training step:
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +22,8 @@ from torch import Tensor, nn
 from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.files.environment_map import read_environment
 from neilfpp_method.effects.places.solver import PlaceSolver
+from neilfpp_method.effects.plan import Plan, stored_decision
+from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
 from neilfpp_method.health.guard import StepGuard
@@ -40,15 +41,12 @@ from neilfpp_method.hosts.outputs import host_name
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import EVAL_RAYS, NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, Total, active_losses, learning_rate, stage_at, weigh
-from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.facts import stated_facts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Maps, Material, PixelBatch, RayBatch, Shading, StepResult, SurfaceHits
 
 __all__ = ["AttachedNeilf", "attach_neilf", "pixel_batch"]
-
-RADIANCE_SCALE = {"linear": 3.0, "srgb": 1.0}
-"""Largest radiance of R by kind of image, HDR and LDR (METHOD §5)."""
 
 log = logging.getLogger(__name__)
 
@@ -67,18 +65,20 @@ class AttachedNeilf(nn.Module):
         proxy: traces rays between surfaces if the host cannot do it cheaply; `proxy.report()` measures its
             error. None if the host traces these rays itself, or if the settings trace no rays.
         light_solver: stores surface points of the training steps and solves for the light at intervals.
-        places: stores more of them, finds an initial light, and searches for paint taken for metal.
+        places: stores more of them, decides on effects, finds an initial light, and searches for paint that
+            was taken for metal.
+        plan: the effects that are simulated, and why (docs/effects.md); `effects.table.effects_table` draws
+            it.
         missing: the optional methods that the host does not have, and the consequence of each.
         step_guard: skips steps of guarded optimizers (`guard`) whose losses or gradients are not finite.
         watch: problems found so far; `health()` summarises them.
     """
 
-    def __init__(self, model: NeilfModel, proxy: SurfaceProxy | None = None) -> None:
+    def __init__(self, model: NeilfModel, plan: Plan, proxy: SurfaceProxy | None = None) -> None:
         super().__init__()
-        self.model = model
-        self.proxy = proxy
+        self.model, self.plan, self.proxy = model, plan, proxy
         self.light_solver = model.light_solver()
-        self.places = PlaceSolver(model.facts.response, log.warning)
+        self.places = PlaceSolver(plan, model.facts.response, log.warning)
         self.missing = missing_capabilities(_inner(model.host))
         host, config, facts = model.host, model.config, model.facts
         # Only tracing light between surfaces needs a host that renders rays from any viewpoint.
@@ -90,7 +90,7 @@ class AttachedNeilf(nn.Module):
             host_name(host), config.shading.hit_share, facts, render, traced_by_host=proxy is None
         )
         self.step_guard = StepGuard(log.warning)
-        self.watch = Watch(None, log.warning)
+        self.watch = Watch(None, log.warning, log.info)
         self._steps, self._with_material = 0, False
         self._last_rendered: tuple[PixelBatch, SurfaceHits] | None = None
         model.observers.append(self._observe)
@@ -130,12 +130,12 @@ class AttachedNeilf(nn.Module):
             # A zero that requires a gradient: a loop without a loss of its own may still call backward.
             return Total(torch.zeros((), device=batch.origins.device, requires_grad=True), {})
         plan = self.model.stages[position.stage]
+        number = self._steps if isinstance(step, str) else int(step)
         if self.training and plan.trains_material:
-            self.places.before_step(self.model, self.light_solver, position)
+            self.places.before_step(self.model, self.light_solver, position, number)
         result = self.model(batch, position.stage, self._host_hits(batch.rays, hits, plan.trains_host))
         total = weigh(result.terms, weights)
         if self.training:
-            number = self._steps if isinstance(step, str) else int(step)
             self._steps = number + 1
             self.step_guard.begin_step(total.terms, number)
             self._after_step(result, position, number)
@@ -235,6 +235,16 @@ class AttachedNeilf(nn.Module):
             *(black.index_put((rows,), part) for part in (shading.color, shading.diffuse, shading.specular))
         )
 
+    def get_extra_state(self) -> dict[str, Any]:
+        """The decisions on effects, as plain values for checkpoints."""
+        return {"decisions": [asdict(decision) for decision in self.plan.decisions]}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned, and use the settings that follow from it."""
+        self.plan.decisions[:] = [stored_decision(values, "checkpoint") for values in state["decisions"]]
+        self.model.use(self.plan.config)
+        self.light_solver.use(self.plan.config.light, self.model.lobe)
+
     # ------------------------------------------------------------------------------------------ inside a step
 
     def _after_step(self, result: StepResult, position: StagePosition, number: int) -> None:
@@ -246,7 +256,8 @@ class AttachedNeilf(nn.Module):
         if not self.places.is_waiting(self.light_solver):
             if self.light_solver.due:
                 self.watch.after_fit(self.light_solver.points, number)
-            self.light_solver.solve(self.model.brdf, self.model.scene)
+            evidence = self.light_solver.solve(self.model.brdf, self.model.scene)
+            self.places.after_fit(self.model, self.light_solver, evidence, number)
         self._with_material = plan.trains_material
         self.watch.after_step(plan, result, number)
         if position.step + 1 == position.length:
@@ -281,7 +292,8 @@ class AttachedNeilf(nn.Module):
             return
         self.first_batches.hits(batch, hits)
         self._last_rendered = batch, hits.detach()
-        if isinstance(self.model.host, ForeignHost):
+        # A proxy only traces rays between surfaces.
+        if isinstance(self.model.host, ForeignHost) and self.model.config.inter_reflection.mode != "off":
             self.model.host.update_proxy(batch.rays, hits)
 
 
@@ -289,6 +301,7 @@ def attach_neilf(
     host: Any,
     config: NeilfConfig | str = "fast",
     *,
+    effects: str = "auto",
     response: str = "linear",
     median_radiance: float = 0.5,
     radiance_scale: float | None = None,
@@ -306,6 +319,8 @@ def attach_neilf(
             docs/hosts.md has a recipe for each.
         config: the settings, or the name of a preset. A preset is used without its first stage for a
             borrowed host (one without `parameter_groups`), so that the material starts at step 0.
+        effects: the effects to simulate, as `neilfpp train --effects` takes them: "auto" decides by evidence
+            as soon as enough surface points are known, "as-set" leaves them as they are in the settings.
         response: meaning of pixel values: "linear" (HDR) or "srgb" (LDR).
         median_radiance: median linear luminance of the object in the images; sets the initial light.
         radiance_scale: largest radiance of the host; if None, 3 for HDR and 1 for LDR.
@@ -316,10 +331,10 @@ def attach_neilf(
         A module with the losses, maps and parameters of material and light.
 
     Raises:
-        UserError: the host has none of these forms or takes other arguments, no preset has this name, an
-            argument is out of range, or the environment map that the settings name cannot be used.
+        UserError: the host has none of these forms or takes other arguments, no preset or effect has this
+            name, an argument is out of range, or the environment map that the settings name cannot be used.
     """
-    facts = _facts(response, median_radiance, radiance_scale, open_scene)
+    facts = stated_facts(response, median_radiance, radiance_scale, open_scene)
     adapted = adapt(host, response)
     borrowed = not isinstance(host, HasParameterGroups)
     if not borrowed:
@@ -331,12 +346,16 @@ def attach_neilf(
         raise UserError(
             f"config is a {type(config).__name__}", "give a NeilfConfig, or the name of a preset, as 'fast'"
         )
+    request = parse_effects(effects)
+    check_effects(request, config)
+    plan = Plan.begin(request, config)
+    config = plan.config_of_model
     devices = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else []
     # Parameters that are made in inference mode could never be trained.
     with torch.inference_mode(False), torch.random.fork_rng(devices):
         proxy = proxy_for(adapted, config)
         complete = adapted if isinstance(adapted, TracesLight) else ForeignHost(adapted, borrowed, proxy)
-        attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), proxy)
+        attached = AttachedNeilf(NeilfModel(complete, config, facts, borrowed=borrowed), plan, proxy)
     if config.known_map is not None:
         attached.model.light.show(read_environment(Path(config.known_map)))
     attached.to(_device_of(host))
@@ -348,25 +367,6 @@ def _device_of(host: Any) -> torch.device:
     """The device of the host's first parameter; the default device if it has none."""
     parameters = host.parameters() if isinstance(host, nn.Module) else iter(())
     return next((p.device for p in parameters), torch.get_default_device())
-
-
-def _facts(
-    response: str, median_radiance: float, radiance_scale: float | None, open_scene: bool
-) -> SceneFacts:
-    """What the arguments of `attach_neilf` say about the images, checked."""
-    if response not in RADIANCE_SCALE:
-        raise UserError(
-            f"response '{response}'",
-            "choose linear (pixels are radiance) or srgb (8-bit images, divided by 255)",
-        )
-    scale = RADIANCE_SCALE[response] if radiance_scale is None else radiance_scale
-    if not 0 < median_radiance < math.inf:
-        raise UserError(
-            f"median_radiance is {median_radiance}", "give the median linear luminance of the object, above 0"
-        )
-    if not 0 < scale < math.inf:
-        raise UserError(f"radiance_scale is {scale}", "give the largest radiance of the host, above 0")
-    return SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
 
 
 def _attachment_summary(attached: AttachedNeilf, borrowed: bool) -> str:

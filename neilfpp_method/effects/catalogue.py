@@ -29,8 +29,8 @@ class Effect:
         not_measured: function of the settings: the reason why no evidence is collected; empty if it is.
         advised: whether evidence is reported but never changes the effect, because it cannot show reliably
             that the effect is not needed.
-        earned: whether the effect needs a significant benefit to be on. Other effects stay on unless their
-            benefit is significantly below the threshold.
+        requires_gain: whether the effect is on only if its gain is significantly above the threshold. Other
+            effects stay on unless their gain is significantly below it.
         needs: name of the effect that this one requires; empty if it requires none.
         solved: whether the light solver decides the effect at every fit, so that evidence changes no
             setting.
@@ -47,7 +47,7 @@ class Effect:
     not_measured: Callable[[NeilfConfig], str] = lambda config: ""
     solved: bool = False
     advised: bool = False
-    earned: bool = False
+    requires_gain: bool = False
     needs: str = ""
 
 
@@ -191,7 +191,7 @@ EFFECTS: Mapping[str, Effect] = {
             risk="metal becomes a dark glossy dielectric",
             not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
             needs="reflection",
-            earned=True,
+            requires_gain=True,
         ),
         Effect(
             name="varying-roughness",
@@ -263,7 +263,7 @@ EFFECTS: Mapping[str, Effect] = {
             obstacle=_pose_obstacle,
             cost=lambda config: f"{config.train.pose_fits} fits of all cameras while G is trained",
             risk="surfaces and colours are blurred",
-            earned=True,
+            requires_gain=True,
         ),
         Effect(
             name="response",

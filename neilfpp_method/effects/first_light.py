@@ -44,7 +44,8 @@ FOLDS = 5
 """One in this many views is held back."""
 LAMP_PIXELS = 4096
 """Number of pixels for the search for lamps. With 1024, the gain by lamps on recovered geometry varied from
-−0.4 % to 2.9 % between random selections (true lamps, standard error 0.5 %); with 4096 from 1.3 % to 2.3 %.
+−0.4 % to 2.9 % between random selections in a scene with lamps (standard error 0.5 %); with 4096 from
+1.3 % to 2.3 %.
 """
 CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
@@ -56,7 +57,7 @@ METAL_FITS = 4.1
 """Time of the evidence for metals in units of a fit to all pixels: four pairs of fits to four fifths of them,
 each with half the usual number of rounds.
 """
-MEASURED = 2000
+TIMED_PIXELS = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
 OVERHEAD_SHARE = 0.3
 """Share that tracing and the search for materials add to the descents of the light, on one core of a server:
@@ -159,7 +160,7 @@ def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -
     # One fit per scale, two fits with and without lamps, and the final fit to all views.
     steps = (1 - 1 / FOLDS) * (whole + (len(SCALES) + 1) * carried) + carried
     steps += (LOBE_FITS * with_lobe + METAL_FITS * with_metals) * whole
-    return (1 + OVERHEAD_SHARE) * steps * seconds_of_step(MEASURED, device) / MEASURED
+    return (1 + OVERHEAD_SHARE) * steps * seconds_of_step(TIMED_PIXELS, device) / TIMED_PIXELS
 
 
 @torch.no_grad()

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 from neilfpp_method.effects.catalogue import EFFECTS, switched
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.request import EffectRequest
+from neilfpp_method.errors import UserError
+from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.settings.types import NeilfConfig
 
-__all__ = ["Decision", "Plan", "decided_settings"]
+__all__ = ["Decision", "Plan", "decided_settings", "stored_decision"]
 
 By = Literal["option", "settings", "files", "evidence"]
 
@@ -41,6 +43,37 @@ class Decision:
     def before_training(self) -> bool:
         """Whether the decision was made before the model was built."""
         return self.by != "evidence"
+
+    def summary(self) -> str:
+        """One line for the console."""
+        return f"effects: {self.effect} {'on' if self.on else 'off'}, {self.reason}"
+
+
+def stored_decision(values: Mapping[str, Any], where: str) -> Decision:
+    """Restore a decision from the plain values of `dataclasses.asdict`.
+
+    Args:
+        values: the values, of unknown origin.
+        where: their origin, for error messages.
+
+    Raises:
+        UserError: the effect is unknown, or a value is missing or of another type.
+    """
+    try:
+        evidence = values["evidence"]
+        decision = from_dict(Decision, {key: v for key, v in values.items() if key != "evidence"}, where)
+    except (TypeError, AttributeError, KeyError) as error:
+        # A key is missing, or a value is not an object.
+        raise UserError(
+            f"{where}: not a complete record ({error})", "restore the file or train again"
+        ) from error
+    if decision.effect not in EFFECTS:
+        raise UserError(
+            f"{where}: no effect '{decision.effect}'", "use the version of neilfpp that wrote the run"
+        )
+    if evidence is None:
+        return decision
+    return replace(decision, evidence=from_dict(Measurement, evidence, where))
 
 
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:
@@ -149,7 +182,7 @@ class Plan:
             step: number of steps trained so far.
         """
         before = self.is_on(name)
-        favoured = measured.favours(before and not EFFECTS[name].earned)
+        favoured = measured.favours(before and not EFFECTS[name].requires_gain)
         advised = EFFECTS[name].advised
         on = before if favoured is None or advised else favoured
         reason = f"{measured.summary()}; shown as advice only" if advised else measured.summary()

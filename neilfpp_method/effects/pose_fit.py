@@ -31,13 +31,13 @@ MIDDLE_GRAY = 0.18
 """Linear value to which the median radiance of a linear capture is brought before it is encoded as sRGB."""
 CONE_RAYS = 3
 """Rays per pixel."""
-AT_ONCE = 1536
+RAYS_AT_ONCE = 1536
 """Maximum number of rays that are rendered at once; it bounds memory."""
-TYPICAL = 0.01
+TYPICAL_CORRECTION = 0.01
 """Standard deviation of the prior on each component of a correction: radians, and scene units. A turn and a
 shift move an object in the image alike; the prior keeps their difference from growing.
 """
-INDEPENDENT = 0.1
+INDEPENDENT_SAMPLES = 0.1
 """Number of independent samples per pixel. The errors of G and R are alike in neighbouring pixels."""
 MIN_ERROR = 1e-4
 """Lower bound on the typical error of a pixel, sRGB."""
@@ -70,7 +70,7 @@ def fit_poses(
     weight = typical / size.clamp_min(typical)
     if model.facts.response == "srgb":
         weight = torch.where(given.color.amax(-1) >= CLIPPED, 0.0, weight)
-    step = _solve(rendered.slope, off / typical, weight * INDEPENDENT, given.view, start, typical)
+    step = _solve(rendered.slope, off / typical, weight * INDEPENDENT_SAMPLES, given.view, start, typical)
     return PoseMotion(start.rotation + step[:, :3], start.shift + step[:, 3:])
 
 
@@ -94,8 +94,8 @@ def _solve(
     """The step that minimises the weighted squares of the errors, in units of `typical`, and the prior."""
     slope, off, weight = slope.double() / typical, off.double(), weight.double()
     before = torch.cat((start.rotation, start.shift), -1).double()
-    matrix = torch.eye(6).to(before).repeat(len(before), 1, 1) / TYPICAL**2
-    right = -before / TYPICAL**2
+    matrix = torch.eye(6).to(before).repeat(len(before), 1, 1) / TYPICAL_CORRECTION**2
+    right = -before / TYPICAL_CORRECTION**2
     matrix.index_add_(0, view, torch.einsum("nci,ncj,n->nij", slope, slope, weight))
     right.index_add_(0, view, torch.einsum("nci,nc,n->ni", slope, off, weight))
     step = torch.linalg.solve(matrix, right)
@@ -112,8 +112,8 @@ def _render(model: NeilfModel, batch: PixelBatch, pixel: Float[Tensor, " V"]) ->
     cone = torch.nn.functional.normalize(directions[:, None] + radius * aside, dim=-1).reshape(-1, 3)
     rays = RayBatch(batch.origins.repeat_interleave(CONE_RAYS, 0), cone)
     view, colors, distances = batch.view.repeat_interleave(CONE_RAYS), [], []
-    for first in range(0, len(cone), AT_ONCE):
-        rows = slice(first, first + AT_ONCE)
+    for first in range(0, len(cone), RAYS_AT_ONCE):
+        rows = slice(first, first + RAYS_AT_ONCE)
         part = rays[rows]
         hits = model.host.render(part)
         color = hits.color if model.gains is None else hits.color * model.gains(view[rows])

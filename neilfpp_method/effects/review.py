@@ -14,7 +14,7 @@ from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.evidence.exposure import Exposures
 from neilfpp_method.effects.evidence.lobes import lobe_evidence
-from neilfpp_method.effects.evidence.material import JUDGED, material_evidence
+from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES, material_evidence
 from neilfpp_method.effects.evidence.metals import find_metal, metals_evidence, metals_evidence_in
 from neilfpp_method.effects.evidence.poses import pose_evidence
 from neilfpp_method.effects.evidence.visibility import self_visibility
@@ -48,10 +48,12 @@ __all__ = [
     "record_facts",
     "record_lamps",
     "review_light",
+    "review_light_at",
     "review_material",
     "review_metals",
     "review_poses",
     "review_surface",
+    "review_visibility",
 ]
 
 SURFACE_PIXELS = 1024
@@ -72,7 +74,7 @@ exact poses reduced the error of R by 1.5 to 3 %, almost as much as those of ina
 """
 MIN_VIEWS = 4
 """Minimum number of views per place: fewer do not distinguish materials."""
-AT_ONCE = 512
+RAYS_AT_ONCE = 512
 """Maximum number of rays that are rendered at once; it bounds memory."""
 USUAL_VIEWS = 8
 """Number of views per place that is assumed when a number of pixels is converted to a number of places."""
@@ -114,7 +116,7 @@ def record_exposures(plan: Plan, exposures: Exposures | None) -> None:
 
 def needs_surface(plan: Plan) -> bool:
     """Whether `review_surface` or `review_material` could decide anything."""
-    return any(plan.is_open(name) for name in ("inter-reflection", *JUDGED, "joint-stage"))
+    return any(plan.is_open(name) for name in ("inter-reflection", *EFFECTS_AT_PLACES, "joint-stage"))
 
 
 @dataclass(frozen=True)
@@ -144,15 +146,14 @@ def review_light(
         return _without_light(plan, step, f"fewer than {MIN_TRAIN_VIEWS} training views")
     if max_pixels < MIN_PIXELS:
         return _without_light(plan, step, "the budget leaves no time for it")
-    places = light_places(model, pixels, max_pixels)
+    with model.evaluating():
+        return review_light_at(light_places(model, pixels, max_pixels), plan, model, step)
+
+
+def review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) -> LightReview:
+    """`review_light` at given places, with the model in evaluation mode."""
     if places.shown_count < MIN_PLACES:
         return _without_light(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
-    with model.evaluating():
-        return _review_light_at(places, plan, model, step)
-
-
-def _review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) -> LightReview:
-    """`review_light` at given places, with the model in evaluation mode."""
     facts, decisions, first = model.facts, [], None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
         measured = lobe_evidence(places, model.scene, facts, model.brdf.metals)
@@ -264,6 +265,14 @@ def review_poses(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int)
     return decisions
 
 
+def review_visibility(plan: Plan, model: NeilfModel, surface: Observed, step: int) -> list[Decision]:
+    """Decide on shadows and inter-reflection at surface points, if this is open."""
+    if not plan.is_open("inter-reflection"):
+        return []
+    measured = self_visibility(model, plan.settings, surface.position, surface.normal)
+    return [plan.decide("inter-reflection", measured, step)]
+
+
 @torch.no_grad()
 def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: int) -> list[Decision]:
     """Take the decisions that depend on the surface: before material init, and before the joint stage.
@@ -281,9 +290,7 @@ def review_surface(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: in
     with model.evaluating():
         rendered = _rendered_surface(model, pixels.sample(SURFACE_PIXELS, gradients=False))
         surface = rendered.observed
-        if plan.is_open("inter-reflection"):
-            measured = self_visibility(model, plan.settings, surface.position, surface.normal)
-            decisions.append(plan.decide("inter-reflection", measured, step))
+        decisions += review_visibility(plan, model, surface, step)
         if plan.is_open("joint-stage") and has_material(step, plan.settings.train):
             decisions.append(plan.decide("joint-stage", shading_disagreement(model, rendered), step))
     return decisions
@@ -295,7 +302,7 @@ def review_material(plan: Plan, model: NeilfModel, pixels: PixelDataset, step: i
 
     The arguments and the result are those of `review_surface`.
     """
-    names = frozenset(name for name in JUDGED if plan.is_open(name))
+    names = frozenset(name for name in EFFECTS_AT_PLACES if plan.is_open(name))
     if not names:
         return []
     with model.evaluating():
@@ -348,8 +355,8 @@ def _rendered_surface(model: NeilfModel, pixels: PixelBatch) -> RenderedSurface:
     """Render pixels and keep those whose ray hits the object."""
     pixels = pixels[torch.nonzero(pixels.mask > 0.5)[:, 0]]
     parts = []
-    for start in range(0, len(pixels), AT_ONCE):
-        part = pixels[start : start + AT_ONCE]
+    for start in range(0, len(pixels), RAYS_AT_ONCE):
+        part = pixels[start : start + RAYS_AT_ONCE]
         hits = model.host.render(part.rays)
         rows = torch.nonzero(hits.is_hit(model.config.shading.hit_share))[:, 0]
         hits, part = hits[rows], part[rows]

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 
+from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.color import apply_response, response_slope
 
-__all__ = ["RadianceUnits", "SceneFacts", "radiance_units"]
+__all__ = ["RadianceUnits", "SceneFacts", "radiance_units", "stated_facts"]
+
+RADIANCE_SCALE = {"linear": 3.0, "srgb": 1.0}
+"""Largest radiance of R by kind of image, HDR and LDR (METHOD §5)."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,33 @@ class SceneFacts:
     background_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
     far_points: bool = False
     log_gains: tuple[float, ...] = ()
+
+
+def stated_facts(
+    response: str, median_radiance: float, radiance_scale: float | None, open_scene: bool
+) -> SceneFacts:
+    """The facts about images that are not at hand; see `attach.attach_neilf` for the arguments.
+
+    Raises:
+        UserError: an argument is out of range.
+
+    Example:
+        >>> stated_facts("srgb", 0.2, None, open_scene=False).radiance_scale
+        1.0
+    """
+    if response not in RADIANCE_SCALE:
+        raise UserError(
+            f"response '{response}'",
+            "choose linear (pixels are radiance) or srgb (8-bit images, divided by 255)",
+        )
+    scale = RADIANCE_SCALE[response] if radiance_scale is None else radiance_scale
+    if not 0 < median_radiance < math.inf:
+        raise UserError(
+            f"median_radiance is {median_radiance}", "give the median linear luminance of the object, above 0"
+        )
+    if not 0 < scale < math.inf:
+        raise UserError(f"radiance_scale is {scale}", "give the largest radiance of the host, above 0")
+    return SceneFacts(response, median_radiance, scale, "inverted_sphere" if open_scene else "constant")
 
 
 @dataclass(frozen=True)

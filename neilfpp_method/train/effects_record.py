@@ -13,16 +13,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 from neilfpp_method.data.files.json_entry import write_json
-from neilfpp_method.effects.catalogue import EFFECTS
-from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.plan import Plan, stored_decision
 from neilfpp_method.effects.request import EffectRequest, parse_effects
 from neilfpp_method.effects.table import rows
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.plain import from_dict
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.json_files import read_json
 
@@ -64,25 +60,12 @@ def read_plan(run: Path, settings: NeilfConfig, before: int | None = None) -> Pl
             f"{path}: a record of another version", "use the version of neilfpp that wrote the run"
         )
     try:
-        decisions = [_decision(entry, str(path)) for entry in stored["decisions"]]
         request = parse_effects(stored["request"])
-    except (TypeError, AttributeError, KeyError) as error:
-        # A key is missing, or a value is not an object.
+    except (AttributeError, KeyError) as error:
         raise UserError(
             f"{path}: not a complete record ({error})", "restore the file or train again"
         ) from error
+    decisions = [stored_decision(entry, str(path)) for entry in stored["decisions"]]
     if before is not None:
         decisions = [one for one in decisions if one.before_training or one.step <= before]
     return Plan(request, settings, decisions)
-
-
-def _decision(entry: dict[str, Any], where: str) -> Decision:
-    evidence = entry["evidence"]
-    decision = from_dict(Decision, {key: value for key, value in entry.items() if key != "evidence"}, where)
-    if decision.effect not in EFFECTS:
-        raise UserError(
-            f"{where}: no effect '{decision.effect}'", "use the version of neilfpp that wrote the run"
-        )
-    if evidence is None:
-        return decision
-    return dataclasses.replace(decision, evidence=from_dict(Measurement, evidence, where))

@@ -11,7 +11,7 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shading_disagreement
-from neilfpp_method.effects.evidence.material import JUDGED
+from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES
 from neilfpp_method.effects.evidence.visibility import self_visibility
 from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.effects.plan import Plan
@@ -68,7 +68,7 @@ def test_self_visibility_is_the_cosine_weighted_share(share):
 def test_a_ball_does_not_occlude_itself_so_nothing_is_traced():
     config = solved_light(tiny_config())
     config = dataclasses.replace(config, shading=dataclasses.replace(config.shading, hit_share=0.2))
-    named = "auto," + ",".join(f"+{name}" for name in (*JUDGED, "joint-stage"))
+    named = "auto," + ",".join(f"+{name}" for name in (*EFFECTS_AT_PLACES, "joint-stage"))
     model, plan = sphere_model(config), Plan.begin(parse_effects(named), config)
     torch.manual_seed(0)
     (decision,) = review_surface(plan, model, OnePicture(), step=4)

@@ -43,7 +43,7 @@ class Alternative:
 
 @torch.no_grad()
 def reduction_in_held_back_views(
-    simple: Alternative, rich: Alternative, folds: int, turns: int, by: str, worth: float
+    simple: Alternative, rich: Alternative, folds: int, turns: int, by: str, threshold: float
 ) -> Measurement:
     """Mean reduction of the relative error of the places by the richer alternative.
 
@@ -53,8 +53,8 @@ def reduction_in_held_back_views(
         folds: number of folds of the views; one of them is held back at a time.
         turns: number of folds that are held back in turn.
         by: what distinguishes the richer alternative, for the description of the measurement.
-        worth: reduction above which the richer alternative is used.
+        threshold: reduction above which the richer alternative is used.
     """
     scale = unbounded_scale(simple.data)
     reductions = (simple.error(turn, folds, scale) - rich.error(turn, folds, scale) for turn in range(turns))
-    return mean_reduction(reductions, f"reduction of the error in held-back views by {by}", worth)
+    return mean_reduction(reductions, f"reduction of the error in held-back views by {by}", threshold)

@@ -18,11 +18,11 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import apply_response
 from neilfpp_method.structures import Observed
 
-__all__ = ["WORTH", "RenderedSurface", "shading_disagreement"]
+__all__ = ["THRESHOLD", "RenderedSurface", "shading_disagreement"]
 
-WORTH = 0.01
+THRESHOLD = 0.01
 """Excess of the relative error of shading over that of R above which the joint stage is worth its cost."""
-AT_ONCE = 256
+POINTS_AT_ONCE = 256
 """Maximum number of points that are shaded at once; it bounds memory."""
 
 
@@ -55,10 +55,11 @@ def shading_disagreement(model: NeilfModel, surface: RenderedSurface) -> Measure
         return (difference / error_unit(pixel, response, unit)).abs().clamp_max(1).mean(-1)
 
     excess = []
-    for start in range(0, len(surface.radiance), AT_ONCE):
-        part, radiance = surface.observed[start : start + AT_ONCE], surface.radiance[start : start + AT_ONCE]
+    for start in range(0, len(surface.radiance), POINTS_AT_ONCE):
+        rows = slice(start, start + POINTS_AT_ONCE)
+        part, radiance = surface.observed[rows], surface.radiance[rows]
         material = model.materials(part.position)
         samples = model.config.shading.eval_samples
         shaded = model.shade(part.position, part.normal, part.wo, material, samples).color
         excess.append(error(shaded, part.pixel) - error(radiance, part.pixel))
-    return mean_of(torch.cat(excess) if excess else surface.radiance[:, 0], what, WORTH)
+    return mean_of(torch.cat(excess) if excess else surface.radiance[:, 0], what, THRESHOLD)

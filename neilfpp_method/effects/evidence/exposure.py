@@ -26,9 +26,9 @@ from neilfpp_method.effects.measurement import Measurement, mean_of
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
 from neilfpp_method.structures import OrientedPoints
 
-__all__ = ["WORTH", "Exposures", "judge_gains", "measure_exposures"]
+__all__ = ["THRESHOLD", "Exposures", "judge_gains", "measure_exposures"]
 
-WORTH = 0.01
+THRESHOLD = 0.01
 """Reduction of the relative error, at points that were not fitted, above which gains are used."""
 POINTS = 2000
 """Number of cloud points, drawn at random. They take one or two seconds and give gains within 1 %."""
@@ -38,7 +38,7 @@ MIN_COSINE = 0.2
 """Minimum cosine between normal and viewing direction. At flatter angles a pixel covers too much of the
 surroundings of the point.
 """
-DARK = 1e-3
+DARK_SHARE = 1e-3
 """Linear values below this share of the mean are treated as noise and left out."""
 ROUNDS = 50
 """Rounds of iteratively reweighted least squares, which alternates between point colours and gains."""
@@ -93,7 +93,7 @@ def judge_gains(log_values: Float[Tensor, "P V 3"], normal: Float[Tensor, "P 3"]
     for held_back in (group, ~group):
         gain = _gains(log_values[~held_back])
         saved = _error(log_values[held_back], torch.zeros_like(gain)) - _error(log_values[held_back], gain)
-        measured.append(mean_of(saved[~saved.isnan()], what, WORTH))
+        measured.append(mean_of(saved[~saved.isnan()], what, THRESHOLD))
     undecided = [measurement for measurement in measured if measurement.favours(chosen=False) is None]
     return undecided[0] if undecided else min(measured, key=lambda measurement: measurement.value)
 
@@ -149,7 +149,7 @@ def _log_mean_around(pixels: PixelDataset, number: int, column: Tensor, row: Ten
     if not pixels.capture.hdr:
         usable &= batch.color.cpu().amax(-1) < CLIPPED
     mean = color.view(-1, 9, 3).mean(1)
-    good = usable.view(-1, 9).all(1, keepdim=True) & (mean > DARK * color.mean())
+    good = usable.view(-1, 9).all(1, keepdim=True) & (mean > DARK_SHARE * color.mean())
     return torch.where(good, mean.clamp_min(1e-20).log(), torch.nan)
 
 

@@ -21,7 +21,7 @@ __all__ = ["lobe_evidence"]
 
 FOLDS = 4
 """Number of folds of the views; every fold is held back in turn."""
-WORTH = 0.0
+THRESHOLD = 0.0
 """Threshold for the reduction of the relative error by GGX: since GGX has no cost, any significant reduction
 is enough.
 """
@@ -42,4 +42,4 @@ def lobe_evidence(places: Places, scene: SceneTracer | None, facts: SceneFacts, 
         return Alternative(PlaceData(places, transport, facts.median_radiance, facts.response), metals)
 
     gaussian, ggx = alternative("spherical_gaussian"), alternative("ggx")
-    return reduction_in_held_back_views(gaussian, ggx, FOLDS, FOLDS, "GGX", WORTH)
+    return reduction_in_held_back_views(gaussian, ggx, FOLDS, FOLDS, "GGX", THRESHOLD)

@@ -38,7 +38,7 @@ from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES
 
-__all__ = ["JUDGED", "WORTH", "judge_material", "material_evidence", "seconds_of_evidence"]
+__all__ = ["EFFECTS_AT_PLACES", "THRESHOLD", "judge_material", "material_evidence", "seconds_of_evidence"]
 
 PLACES = 160
 """Maximum number of places. With `VIEWS` this takes seconds and 300 MB on a laptop."""
@@ -50,19 +50,19 @@ TURNS = 2
 """Number of folds that are held back in turn. Two of the four keep the time within bounds."""
 MIN_VIEWS = 4
 """Minimum number of views per place: fewer do not distinguish materials."""
-WORTH = 0.01
+THRESHOLD = 0.01
 """Reduction of the relative error above which an effect is worth its cost."""
 CARRIED_ROUNDS = 2
 """Alternations of light and material in the fits with one roughness, which start from the fit with all
-effects. The other fits do not: the light of that fit is too good for surfaces without reflection.
+effects. The other fits start anew, because the light of that fit contains what reflections have revealed.
 """
 FITS = 14
 """Time of all measurements at places before one stage, in units of the time of one fit of this size
 (estimate): 8 fits, 6 that take a quarter of the time, and the noise of lobe sampling.
 """
-REST = 0.5
+OTHER_TIME_SHARE = 0.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""
-SHARED = (2, 4, 6, 8)
+SHARED_ROUGHNESSES = (2, 4, 6, 8)
 """Indices in `ROUGHNESSES` that are tried as the common roughness of all places."""
 MIN_INDEX_DIFFERENCE = 2
 """A place has another roughness than the common one if its index differs by at least this much."""
@@ -71,15 +71,15 @@ LIGHT_FORMS: Mapping[str, Callable[[Tensor], Tensor]] = {
     "coloured-light": lambda log_radiance: log_radiance.mean(0, keepdim=True).expand_as(log_radiance),
 }
 """Projection of a map onto the maps that are possible without an effect: a single colour, or grey."""
-SAVED: Mapping[str, str] = {
+MEASURED_QUANTITIES: Mapping[str, str] = {
     "reflection": "reduction of the error in held-back views by specular reflection",
     "varying-roughness": "reduction of the error in held-back views by varying roughness, where it differs",
     "environment-map": "reduction of the error in held-back views by a map over a single colour",
     "coloured-light": "reduction of the error in held-back views by colours of the map",
 }
-"""What is measured for each effect, as it appears in the table of effects."""
-JUDGED = (*SAVED, "lobe-sampling")
-"""Names of the effects that are measured at places."""
+"""The quantity that is measured for each effect, as it appears in the table of effects."""
+EFFECTS_AT_PLACES = (*MEASURED_QUANTITIES, "lobe-sampling")
+"""Names of the effects that are measured at places before a material stage."""
 
 
 @torch.no_grad()
@@ -99,14 +99,14 @@ def material_evidence(
         pixels: the training pixels.
         position: points on the surface, scene frame; the first `PLACES` are used.
         normal: unit normals at these points.
-        names: the effects to measure, a subset of `JUDGED`.
+        names: the effects to measure, a subset of `EFFECTS_AT_PLACES`.
 
     Returns:
         A measurement for each name. It has no samples if no place is seen by `MIN_VIEWS` views.
     """
     places = gather_places(model, pixels, position[:PLACES], normal[:PLACES], VIEWS).with_at_least(MIN_VIEWS)
     if not len(places.place):
-        return {name: Measurement("views of the same place", 0.0, 0.0, WORTH, 0) for name in names}
+        return {name: Measurement("views of the same place", 0.0, 0.0, THRESHOLD, 0) for name in names}
     transport = place_transport(places, LOBES[model.config.shading.lobe], model.scene)
     data = PlaceData(places, transport, model.facts.median_radiance, model.facts.response)
     judged = judge_material(data, names, model.brdf.metals)
@@ -122,7 +122,7 @@ def seconds_of_evidence(device: torch.device) -> float:
     light, whose steps are timed (`places.fit.seconds_of_step`).
     """
     step = seconds_of_step(PLACES * VIEWS * (FOLDS - 1) // FOLDS, device)
-    return (1 + REST) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
+    return (1 + OTHER_TIME_SHARE) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
 
 
 @dataclass(frozen=True)
@@ -213,21 +213,21 @@ def judge_material(data: PlaceData, names: frozenset[str], metals: bool) -> Judg
         def with_roughness(number: int, turn: int) -> Explained:
             return explain(splits[turn], replace(glossy, roughness=number), glossy_fits[turn].fit)
 
-        shared = min(SHARED, key=lambda number: with_roughness(number, 0).fitted_error)
+        shared = min(SHARED_ROUGHNESSES, key=lambda number: with_roughness(number, 0).fitted_error)
         shared_fits = [with_roughness(shared, turn) for turn in range(TURNS)]
         counted = [(one.fit.roughness - shared).abs() >= MIN_INDEX_DIFFERENCE for one in glossy_fits]
-        measured["varying-roughness"] = _saved("varying-roughness", shared_fits, glossy_fits, counted)
+        measured["varying-roughness"] = _reduction("varying-roughness", shared_fits, glossy_fits, counted)
     if "reflection" in names:
         matte = Variant(Permitted(metals=False), reflects=False)
-        measured["reflection"] = _saved("reflection", explain_all(matte), glossy_fits)
+        measured["reflection"] = _reduction("reflection", explain_all(matte), glossy_fits)
     for name, form in LIGHT_FORMS.items():
         if name in names:
             limited = Variant(Permitted(metals, form=form))
-            measured[name] = _saved(name, explain_all(limited), glossy_fits)
-    return Judged({name: measured[name] for name in SAVED if name in names}, glossy_fits[0].fit)
+            measured[name] = _reduction(name, explain_all(limited), glossy_fits)
+    return Judged({name: measured[name] for name in MEASURED_QUANTITIES if name in names}, glossy_fits[0].fit)
 
 
-def _saved(
+def _reduction(
     name: str,
     without: Sequence[Explained],
     having: Sequence[Explained],
@@ -238,4 +238,4 @@ def _saved(
     if counted is not None:
         gains = [gain[rows] for gain, rows in zip(gains, counted, strict=True)]
     gain = torch.cat(gains)
-    return mean_of(gain[gain.isfinite()], SAVED[name], WORTH)
+    return mean_of(gain[gain.isfinite()], MEASURED_QUANTITIES[name], THRESHOLD)

@@ -41,29 +41,31 @@ TURNS = 4
 """Number of folds that are held back in turn. With only one, the standard error would be as large as the
 increase of the error that metals cause in a scene without metal.
 """
-WORTH = 0.0
+THRESHOLD = 0.0
 """Threshold for the reduction of the relative error. Metals take no additional time, so they are left out
 only if they increase the error.
 """
-WORTH_UNDER_LIGHT = 0.0003
+THRESHOLD_UNDER_LIGHT = 0.0003
 """The same under the trained light, where the standard error can be smaller than any visible benefit: a ball
-without metal had 0.006 ± 0.003 %. The demo has 0.11 %.
+without metal had a reduction of 0.006 ± 0.003 %. The demo, of which 12 % is metal, has 0.11 %.
 """
-WORTH_IN_DISPLAY_VALUES = 0.035
+THRESHOLD_IN_DISPLAY_VALUES = 0.035
 """The same for images with display values. Three captures of photographs without metal had reductions of 1.5
-to 2.3 %; an object of which a third is metal had 5 % after a tone curve (docs/effects.md).
+to 2.3 %; an object of which a third is metal had 5 % after a tone curve
+(docs/notebook/2026-11-27-decisions-on-effects.md).
 """
 METAL_RATIO = 0.95
 """A place is metal under the trained light if the error of the best metal is below this share of that of the
-best paint. In the demo this selects half of the metal and 7 % of the paint; a ratio of 1, 85 % and 28 %.
+best paint. In the demo this selects half of the metal and 7 % of the paint; a ratio of 1 would select 85 %
+and 28 %.
 """
 
 
 def metals_evidence(data: PlaceData) -> Measurement:
     """Mean reduction of the relative error of the places by metals, in held-back views."""
     paint, metal = Alternative(data, metals=False), Alternative(data, metals=True)
-    worth = WORTH_IN_DISPLAY_VALUES if data.response == "srgb" else WORTH
-    return reduction_in_held_back_views(paint, metal, FOLDS, TURNS, "metals", worth)
+    threshold = THRESHOLD_IN_DISPLAY_VALUES if data.response == "srgb" else THRESHOLD
+    return reduction_in_held_back_views(paint, metal, FOLDS, TURNS, "metals", threshold)
 
 
 @torch.no_grad()
@@ -71,8 +73,8 @@ def metals_evidence_in(lit: LitPlaces, response: str) -> Measurement:
     """The same as `metals_evidence`, under a fixed light."""
     reductions = (_reduction_in_held_back_views(lit, turn) for turn in range(FOLDS))
     what = "reduction of the error in held-back views by metals, under the trained light"
-    worth = WORTH_IN_DISPLAY_VALUES if response == "srgb" else WORTH_UNDER_LIGHT
-    return mean_reduction(reductions, what, worth)
+    threshold = THRESHOLD_IN_DISPLAY_VALUES if response == "srgb" else THRESHOLD_UNDER_LIGHT
+    return mean_reduction(reductions, what, threshold)
 
 
 def _reduction_in_held_back_views(lit: LitPlaces, turn: int) -> Float[Tensor, " P"]:

@@ -17,15 +17,15 @@ from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.incident import Sources, arriving
-from neilfpp_method.lighting.objective import FLOOR
+from neilfpp_method.lighting.objective import ERROR_FLOOR
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES, Sampling, sample_directions, shade
 
-__all__ = ["WORTH", "lobe_noise"]
+__all__ = ["THRESHOLD", "lobe_noise"]
 
-WORTH = 0.01
+THRESHOLD = 0.01
 """Reduction of the relative noise of a pixel above which the lobe is sampled."""
-TIMES = 8
+SHADINGS = 8
 """Number of times that a pixel is shaded; its standard deviation is then known to about 25 %."""
 
 
@@ -52,13 +52,13 @@ def lobe_noise(model: NeilfModel, places: Places, fit: PlaceFit) -> Measurement:
     def noise(sampler: str) -> Float[Tensor, " P"]:
         sampling = Sampling(sampler, count, lobe, stochastic=True)
         colors = []
-        for _ in range(TIMES):
+        for _ in range(SHADINGS):
             drawn = sample_directions(
                 sampling, observed.normal, observed.wo, material.roughness, light.technique(observed.normal)
             )
             arrived = arriving(sources, observed.position, drawn)
             colors.append(shade(material, observed.normal, observed.wo, arrived, lobe).color)
         spread = torch.stack(colors).std(0, correction=1)
-        return (spread / (observed.pixel + FLOOR * model.facts.median_radiance)).clamp_max(1).mean(-1)
+        return (spread / (observed.pixel + ERROR_FLOOR * model.facts.median_radiance)).clamp_max(1).mean(-1)
 
-    return mean_of(noise("no_lobe") - noise("mis"), what, WORTH)
+    return mean_of(noise("no_lobe") - noise("mis"), what, THRESHOLD)

@@ -20,11 +20,12 @@ from neilfpp_method.fields.poses import PoseMotion
 from neilfpp_method.lighting.decision import MIN_SAMPLES
 from neilfpp_method.model import NeilfModel
 
-__all__ = ["WORTH", "next_motion", "pose_evidence"]
+__all__ = ["THRESHOLD", "next_motion", "pose_evidence"]
 
-WORTH = 0.03
-"""Reduction of the error at held-back pixels above which poses are corrected. Noise of 0.3° had 3.5 to 7 %.
-With accurate poses it was at most 0.5 %, but 1.5 ± 0.4 % in the short demo, whose G and R are blurred.
+THRESHOLD = 0.03
+"""Reduction of the error at held-back pixels above which poses are corrected. With random errors of 0.3°
+the reduction was 3.5 to 7 %. With accurate poses it was at most 0.5 %, except in the short demo, whose G and
+R are blurred (1.5 ± 0.4 %).
 """
 JUDGED_VIEWS = 10
 """Maximum number of views in which poses are judged."""
@@ -60,7 +61,7 @@ def pose_evidence(model: NeilfModel, given: PixelDataset) -> Measurement:
             saved.append(1 - after / _by_view(before[is_held_back], part.view, views))
     values = torch.stack(saved)[:, judged].flatten()
     what = "reduction of the error of R by corrected poses, at held-back pixels"
-    return mean_of(values[values.isfinite()], what, WORTH)
+    return mean_of(values[values.isfinite()], what, THRESHOLD)
 
 
 @torch.no_grad()

@@ -19,9 +19,9 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.sampling import cosine
 from neilfpp_method.structures import RayBatch
 
-__all__ = ["WORTH", "blocked_share", "self_visibility"]
+__all__ = ["THRESHOLD", "blocked_share", "self_visibility"]
 
-WORTH = 0.01
+THRESHOLD = 0.01
 """Mean occluded share above which shadows and inter-reflection are simulated. It equals the threshold for
 lamps (`lighting.fit.MIN_GAIN`).
 """
@@ -49,7 +49,7 @@ def self_visibility(
         normal: unit normals at these points.
     """
     share = blocked_share(model, settings, position, normal) if len(position) else position[:, 0]
-    return mean_of(share, "directions of surface points that the scene occludes", WORTH)
+    return mean_of(share, "directions of surface points that the scene occludes", THRESHOLD)
 
 
 def blocked_share(

@@ -27,7 +27,7 @@ from neilfpp_method.effects.places.grid import (
     relative_error,
 )
 from neilfpp_method.lighting.layered_transport import layers_at
-from neilfpp_method.lighting.objective import OUTLIER, total_variation, white_balance
+from neilfpp_method.lighting.objective import OUTLIER_ERROR, total_variation, white_balance
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.structures import Material
 
@@ -61,7 +61,7 @@ START_BASE_COLOR = 0.3
 """Initial base colour of all places."""
 START_ROUGHNESS = 4
 """Index of the initial roughness of all places."""
-TRIED = 3
+TIMED_STEPS = 3
 """Number of descent steps that `seconds_of_step` times."""
 
 
@@ -171,7 +171,7 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
     """Improve the light and the base colours by descent, with fixed roughness and metallic."""
     place = data.places.place
     # The base colour of a place without pixels is arbitrary.
-    shown = place.unique()
+    with_pixels = place.unique()
     selected = _at_roughness(data.transport, fit.roughness[place])
     material = fit.material(place)
     mean_transport = selected.sources[0].mean(0)
@@ -186,14 +186,14 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
             radiance = permitted.form(log_radiance).exp().flatten(1).t()
             outgoing = selected.outgoing(candidate, radiance)
             error = relative_error(outgoing, data.places, data.typical)
-            loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
+            loss = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER_ERROR)
             loss = loss + SMOOTHNESS * total_variation(log_radiance)
             contribution = mean_transport[:, None] * radiance
             loss = loss + white_balance(contribution, contribution.sum(0), data.response)
             loss = loss + HIGH_BASE_COLOR_WEIGHT * (base_color - HIGH_BASE_COLOR).clamp_min(0).square().mean()
             if permitted.mean_base_color is not None:
-                off = _log_mean(base_color[shown]) - math.log(permitted.mean_base_color)
-                loss = loss + SCALE_WEIGHT * off.square()
+                scale_error = _log_mean(base_color[with_pixels]) - math.log(permitted.mean_base_color)
+                loss = loss + SCALE_WEIGHT * scale_error.square()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -213,8 +213,8 @@ def seconds_of_step(pixels: int, device: torch.device) -> float:
     transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
     light = torch.ones(2 * ROWS**2, 3, device=device)
     began = time.perf_counter()
-    for _ in range(TRIED):
+    for _ in range(TIMED_STEPS):
         back = transport.T @ (transport @ light)
     # `item` waits for the device.
     back.sum().item()
-    return (time.perf_counter() - began) / TRIED
+    return (time.perf_counter() - began) / TIMED_STEPS

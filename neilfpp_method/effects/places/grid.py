@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from neilfpp_method.effects.places.gathering import Places
-from neilfpp_method.lighting.objective import FLOOR, OUTLIER
+from neilfpp_method.lighting.objective import ERROR_FLOOR, OUTLIER_ERROR
 from neilfpp_method.shading.brdf import DIELECTRIC_F0
 from neilfpp_method.structures import Material
 
@@ -30,7 +30,7 @@ ROUGHNESSES = (0.08, 0.14, 0.2, 0.28, 0.36, 0.45, 0.55, 0.66, 0.8, 1.0)
 """Grid of roughness. The width of the lobe changes by about a half from one value to the next."""
 METALLICS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 """Grid of metallic."""
-REWEIGHTED = 4
+REWEIGHTED_ITERATIONS = 4
 """Iterations of reweighted least squares for the base colour."""
 MIN_BASE_COLOR = 0.01
 """Smallest base colour, so that its logarithm is finite."""
@@ -87,7 +87,7 @@ def neighbors(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"
 def relative_error(outgoing: Float[Tensor, "N 3"], places: Places, typical: float) -> Float[Tensor, "N 3"]:
     """Error of rendered pixels relative to the recorded ones."""
     pixel = places.observed.pixel
-    return (outgoing - pixel) / (pixel + FLOOR * typical)
+    return (outgoing - pixel) / (pixel + ERROR_FLOOR * typical)
 
 
 @torch.no_grad()
@@ -111,7 +111,7 @@ def best_materials(
         metallics: indices in `METALLICS` of the values that are tried.
         near: indices of the neighbours of each place, including itself (`neighbors`).
     """
-    diffuse, unit = parts[0], places.observed.pixel + FLOOR * typical
+    diffuse, unit = parts[0], places.observed.pixel + ERROR_FLOOR * typical
     first = torch.zeros(places.count, dtype=torch.long, device=unit.device)
     base_color = torch.full((places.count, 3), MIN_BASE_COLOR, device=unit.device)
     best = BestMaterials(base_color, first, first, torch.full_like(base_color[:, 0], torch.inf))
@@ -123,11 +123,11 @@ def best_materials(
             slope = ((1 - m) * diffuse + m * facing) / unit
             target = (places.observed.pixel - DIELECTRIC_F0 * (1 - m) * facing - grazing) / unit
             weight = torch.ones_like(slope)
-            for _ in range(REWEIGHTED):
+            for _ in range(REWEIGHTED_ITERATIONS):
                 squares = places.mean(weight * slope.square()).clamp_min(1e-12)
                 candidate = (places.mean(weight * slope * target) / squares).clamp(MIN_BASE_COLOR, 1)
                 error = candidate[places.place] * slope - target
-                weight = 1 / error.abs().clamp_min(OUTLIER)
+                weight = 1 / error.abs().clamp_min(OUTLIER_ERROR)
             loss = mean_loss(error, places, near)
             numbers = torch.full_like(best.roughness, k), torch.full_like(best.roughness, j)
             best = best.where(~(loss < best.loss), BestMaterials(candidate, *numbers, loss))
@@ -137,6 +137,6 @@ def best_materials(
 def mean_loss(error: Float[Tensor, "N 3"], places: Places, near: Int[Tensor, "P M"]) -> Float[Tensor, " P"]:
     """Mean Huber loss of the relative errors of all pixels of each place and its neighbours."""
     zero = torch.zeros_like(error)
-    loss = functional.smooth_l1_loss(error, zero, beta=OUTLIER, reduction="none").mean(-1)
+    loss = functional.smooth_l1_loss(error, zero, beta=OUTLIER_ERROR, reduction="none").mean(-1)
     pixels = torch.bincount(places.place, minlength=places.count).to(loss.dtype)
     return (pixels * places.mean(loss))[near].sum(1) / pixels[near].sum(1).clamp_min(1)

@@ -29,7 +29,7 @@ __all__ = ["METAL", "PAINT", "LitPlaces", "light_up"]
 
 PAINT, METAL = range(1), range(1, len(METALLICS))
 """Indices in `METALLICS` of paint and of metal."""
-DRAWS = 2
+DIRECTIONS = 2
 """Random directions per texel and pixel."""
 NEIGHBORS_SHARE = 1 / 150
 """Share of the places whose errors are added when the material of a place is chosen."""
@@ -109,7 +109,7 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     places = places.only_shown()
     shared = places.shared_points()
     light = LightModel(model.light, model.lamps)
-    draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DRAWS)]
+    draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DIRECTIONS)]
     layers = LightLayers(
         torch.stack([drawn.light for drawn in draws]).mean(0),
         torch.stack([drawn.scene for drawn in draws]).mean(0),

@@ -1,4 +1,4 @@
-"""Initial light and searches for materials in a training loop without a data set of images.
+"""Effects, initial light and searches for materials in a training loop without a data set of images.
 
 `gathering.gather_places` asks a data set for the pixels that show a place. A loop into which NeILF++ is
 attached hands over only batches of pixels. If many batches are remembered, most surface points have
@@ -7,17 +7,25 @@ neighbours that other views showed, and neighbours together are a place.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import nn
 
-from neilfpp_method.effects.first_light import MIN_PLACES, find_first_light, seconds_of_pixel, start_with
-from neilfpp_method.effects.places.data import PlaceData, place_transport
+from neilfpp_method.effects.first_light import seconds_of_pixel, start_with
 from neilfpp_method.effects.places.gathering import MIN_COSINE, SAME_NORMAL, Places
 from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
-from neilfpp_method.effects.review import improve_material
+from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.review import (
+    SURFACE_PIXELS,
+    improve_material,
+    record_lamps,
+    review_light_at,
+    review_metals,
+    review_visibility,
+)
+from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
@@ -43,13 +51,14 @@ class PlaceSolver(nn.Module):
     """Remembers surface points of training steps, and fits light and material to the places they form.
 
     Args:
+        plan: the effects; those that are open are decided here, by evidence at the places.
         response: response of the pixels, "linear" or "srgb".
         say: prints a line.
     """
 
-    def __init__(self, response: str, say: Callable[[str], object]) -> None:
+    def __init__(self, plan: Plan, response: str, say: Callable[[str], object]) -> None:
         super().__init__()
-        self.response, self.say = response, say
+        self.plan, self.response, self.say = plan, response, say
         self.points = Ring(PIXELS, Observed.WIDTH)
         self._steps, self._tried, self._searched = 0, False, -1
 
@@ -67,21 +76,33 @@ class PlaceSolver(nn.Module):
         self.points.keep(surface.rows()[usable])
         self._steps += 1
 
-    def before_step(self, model: NeilfModel, light_solver: LightSolver, position: StagePosition) -> None:
+    def before_step(
+        self, model: NeilfModel, light_solver: LightSolver, position: StagePosition, step: int
+    ) -> None:
         """Start the light, or improve light and material, if this is due before a step with material.
 
         This changes parameters, which is not allowed between the losses of a step and their gradients.
+
+        Args:
+            model: the model that is trained.
+            light_solver: solves for the light of this model.
+            position: position of the step in its stage.
+            step: index of the step in all stages.
         """
         # The fits need full precision, even within the autocast of the caller's loop.
         with torch.autocast(self.points.rows.device.type, enabled=False):
             if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
                 self._tried = True
-                self._start_light(model, light_solver)
+                self._start_light(model, light_solver, step)
             if is_comparison_due(model, position) and position.step != self._searched:
                 self._searched = position.step
-                improved = improve_material(model, light_solver, self.places(), is_search_due(position))
-                for summary in () if improved is None else improved.summaries:
-                    self.say(summary)
+                self._improve(model, light_solver, is_search_due(position), step)
+
+    def after_fit(
+        self, model: NeilfModel, light_solver: LightSolver, evidence: Evidence | None, step: int
+    ) -> None:
+        """Record what a fit of the light has decided on lamps."""
+        self._follow(record_lamps(self.plan, evidence, model.lamps.count, step), model, light_solver)
 
     @torch.no_grad()
     def places(self) -> Places:
@@ -99,19 +120,41 @@ class PlaceSolver(nn.Module):
         places = Places(len(center), place, fold, observed)
         return places.where(torch.nonzero(same)[:, 0]).with_at_least(MIN_PIXELS)
 
-    def _start_light(self, model: NeilfModel, light_solver: LightSolver) -> None:
-        """Set an initial light and material that explain the places (`effects.first_light`).
+    def _start_light(self, model: NeilfModel, light_solver: LightSolver, step: int) -> None:
+        """Decide on effects, and set an initial light and material that explain the places.
 
-        If there are too few places, the first fit starts from an even light.
+        If there are too few places, no effect is decided, and the first fit starts from an even light.
         """
+        surface = Observed.of_rows(self.points.kept()[:SURFACE_PIXELS])
+        self._follow(review_visibility(self.plan, model, surface, step), model, light_solver)
         places = self.places()
-        if model.lobe is None or places.shown_count < MIN_PLACES:
+        rate = seconds_of_pixel(
+            places.place.device,
+            with_lobe=self.plan.is_open("long-tails"),
+            with_metals=self.plan.is_open("metals"),
+        )
+        self.say(f"the search for effects and an initial light takes about {rate * len(places.place):.0f} s")
+        review = review_light_at(places, self.plan, model, step)
+        self._follow(review.decisions, model, light_solver)
+        if review.first is not None:
+            self.say(review.first.summary())
+            self.after_fit(model, light_solver, start_with(model, light_solver, review.first), step)
+
+    def _improve(self, model: NeilfModel, light_solver: LightSolver, with_search: bool, step: int) -> None:
+        """Correct the scale of a half-trained model, and review metals (`review.improve_material`)."""
+        improved = improve_material(model, light_solver, self.places(), with_search)
+        if improved is None:
             return
-        rate = seconds_of_pixel(places.place.device, with_lobe=False, with_metals=False)
-        self.say(f"the search for an initial light takes about {rate * len(places.place):.0f} s")
-        transport = place_transport(places, model.lobe, model.scene)
-        data = PlaceData(places, transport, model.facts.median_radiance, model.facts.response)
-        first = find_first_light(data, model.brdf.metals)
-        if first is not None:
-            self.say(first.summary())
-            start_with(model, light_solver, first)
+        for summary in improved.summaries:
+            self.say(summary)
+        if with_search:
+            decisions = review_metals(self.plan, model, improved.lit, step)
+            self._follow(decisions, model, light_solver)
+
+    def _follow(self, decisions: Sequence[Decision], model: NeilfModel, light_solver: LightSolver) -> None:
+        """Print decisions, and use the settings that follow from the plan."""
+        for decision in decisions:
+            self.say(decision.summary())
+        if decisions:
+            model.use(self.plan.config)
+            light_solver.use(self.plan.config.light, model.lobe)

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from neilfpp_method.effects.evidence.material import WORTH, judge_material
+from neilfpp_method.effects.evidence.material import THRESHOLD, judge_material
 from neilfpp_method.effects.evidence.noise import lobe_noise
 from neilfpp_method.effects.places.data import ROWS
 from neilfpp_method.effects.places.fit import Permitted, PlaceFit, fit_places, place_errors
@@ -50,9 +50,9 @@ def gain_of_metals(places: Places) -> tuple[float, float]:
 def test_metals_reduce_the_error_for_a_metal_ball_and_not_for_a_painted_one():
     of_metal, share = gain_of_metals(ball_of(1.0))
     of_paint, share_of_paint = gain_of_metals(ball_of(0.0))
-    assert of_metal > 2 * WORTH
+    assert of_metal > 2 * THRESHOLD
     assert share > 0.2  # the dark side of the sky contains little information
-    assert of_paint < 0.2 * WORTH
+    assert of_paint < 0.2 * THRESHOLD
     assert share_of_paint == 0
 
 
