@@ -6,11 +6,11 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from neilfpp_method.shading.frame import dot, safe_normalize
-from neilfpp_method.structures import IncidentSamples, Indexable
+from neilfpp_method.structures import IncidentSamples, Indexable, SceneTracer
 
 __all__ = ["LampPlaces", "LampRays", "Lamps", "emission", "rays_towards"]
 
@@ -42,6 +42,17 @@ class LampRays:
     def samples(self) -> IncidentSamples:
         """One direction per lamp as samples: the mean of f/pdf over K is the sum over the lamps."""
         return IncidentSamples(self.wi, 1 / (self.wi.shape[1] * self.solid_angle))
+
+    def visibility(self, x: Float[Tensor, "N 3"], scene: SceneTracer | None) -> Bool[Tensor, "N K"]:
+        """Whether a shadow ray from x reaches the centre of a lamp; without a scene, nothing occludes it.
+
+        Args:
+            x: the points from which the rays start.
+            scene: traces the shadow rays; None if inter-reflection is off.
+        """
+        if scene is None:
+            return torch.ones_like(self.distance, dtype=torch.bool)
+        return scene(x, self.wi).distance >= self.distance
 
 
 class Lamps(nn.Module):

@@ -74,8 +74,7 @@ def _from_lamps(sources: Sources, x: Float[Tensor, "N 3"]) -> Incident:
     rays = sources.lamps.rays_from(x)
     radiance = sources.lamps.arriving(rays)
     if sources.scene is not None:
-        visibility = sources.scene(x, rays.wi).distance >= rays.distance
-        radiance = radiance * visibility[..., None]
+        radiance = radiance * rays.visibility(x, sources.scene)[..., None]
     number = Source.LAMPS + torch.arange(sources.lamps.count, device=x.device)
     return Incident(rays.wi, radiance, rays.solid_angle, number.expand(rays.distance.shape))
 

@@ -47,11 +47,8 @@ def from_lamps(
 def in_sight(
     lamps: LampPlaces, radius: float, x: Float[Tensor, "N 3"], scene: SceneTracer | None
 ) -> Bool[Tensor, "N M"]:
-    """Whether the centre of a lamp is visible from a point."""
-    rays = rays_towards(x, lamps.position, lamps.axis, radius)
-    if scene is None:
-        return torch.ones_like(rays.distance, dtype=torch.bool)
-    return scene(x, rays.wi).distance >= rays.distance
+    """Whether the centre of a lamp is visible from a point (see `LampRays.visibility`)."""
+    return rays_towards(x, lamps.position, lamps.axis, radius).visibility(x, scene)
 
 
 def lamp_kernel(
