@@ -26,7 +26,7 @@ __all__ = [
     "surface",
 ]
 
-MISS = 0.02
+MISS_DISTANCE = 0.02
 """Distance by which a ray misses the object, scene units, at which its mask loss grows by 1."""
 TINY_DEPTH = 1e-12
 """Optical depths are raised to at least this value, so that the gradient of their logarithm is finite. A ray
@@ -57,7 +57,7 @@ def mask(
     known: Float[Tensor, " N"],
     beta: Float[Tensor, ""],
 ) -> LossTerm:
-    """Mask loss: ln(1 + τ) off the object, and e^−τ + β/d ln(1 + 1/τ) on it, with d = `MISS`.
+    """Mask loss: ln(1 + τ) off the object, and e^−τ + β/d ln(1 + 1/τ) on it, with d = `MISS_DISTANCE`.
 
     τ is the optical depth of the ray. A loss on the opacity 1 − e^−τ alone has no gradient where it is wrong:
 
@@ -73,7 +73,7 @@ def mask(
         known: 1 where the mask is known; the loss is 0 elsewhere.
         beta: scale β of the density, scene units.
     """
-    missed = beta / MISS * functional.softplus(-depth.clamp_min(TINY_DEPTH).log())
+    missed = beta / MISS_DISTANCE * functional.softplus(-depth.clamp_min(TINY_DEPTH).log())
     on_object, off_object = torch.exp(-depth) + missed, depth.log1p()
     return LossTerm(known * (object_mask * on_object + (1 - object_mask) * off_object))
 

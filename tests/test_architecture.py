@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 PACKAGE = "neilfpp_method"
 ROOT = Path(__file__).parent.parent / PACKAGE
+PAGE = ROOT.parent / "docs" / "architecture.md"
 SOURCES = {
     ".".join((PACKAGE, *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__"): path
     for path in sorted(ROOT.rglob("*.py"))
@@ -161,6 +163,18 @@ def test_modules_are_short(source):
     assert len(SOURCES[module].read_text().splitlines()) <= MAX_LINES
 
 
+def page_layers(text: str) -> tuple[tuple[str, ...], ...]:
+    """The rooms of each layer in the numbered list of docs/architecture.md."""
+    section = text.split("\n## Which module may import which\n")[1].split("\n## ")[0]
+    lines = re.findall(r"^\d+\. (.+)$", section, re.MULTILINE)
+    return tuple(tuple(re.findall(r"`([^`]+)`", line)) for line in lines)
+
+
+def test_the_page_names_the_same_layers():
+    rooms = [sorted(layer) for layer in page_layers(PAGE.read_text(encoding="utf-8"))]
+    assert rooms == [sorted(layer) for layer in LAYERS]
+
+
 # ----------------------------------------------------------------------------------- the tests above can fail
 
 
@@ -199,6 +213,11 @@ def test_modules_are_short(source):
 )
 def test_the_order_is_checked_in_both_directions(module, imported, wrong):
     assert backward(f"{PACKAGE}.{module}", f"{PACKAGE}.{imported}") == wrong
+
+
+def test_a_layer_of_the_page_with_another_room_is_found():
+    text = "\n## Which module may import which\n\n1. `errors`, `timing`\n2. `settings`\n\n## Next\n1. `no`\n"
+    assert page_layers(text) == (("errors", "timing"), ("settings",))
 
 
 def test_imports_are_found_at_any_place():

@@ -63,7 +63,7 @@ BETA = torch.tensor(0.002)
 def test_mask_loss_counts_only_known_pixels():
     depth = torch.full((4,), math.e - 1)
     on_object, known = torch.tensor([1.0, 0.0, 1.0, 0.5]), torch.tensor([1.0, 1.0, 0.0, 1.0])
-    term = losses.mask(depth, on_object, known, beta=torch.tensor(losses.MISS))
+    term = losses.mask(depth, on_object, known, beta=torch.tensor(losses.MISS_DISTANCE))
     on_it = math.exp(1 - math.e) + math.log1p(1 / (math.e - 1))
     assert term.values.tolist() == pytest.approx([on_it, 1.0, 0.0, (1 + on_it) / 2])
 
@@ -80,7 +80,7 @@ def test_the_mask_loss_pulls_the_surface_to_rays_that_miss_it():
     depth = (-missed_by.requires_grad_() / BETA).exp()
     term = losses.mask(depth, torch.ones(2), torch.ones(2), BETA)
     (gradient,) = torch.autograd.grad(term.values.sum(), missed_by)
-    assert gradient.tolist() == pytest.approx([1 / losses.MISS] * 2, rel=0.1)
+    assert gradient.tolist() == pytest.approx([1 / losses.MISS_DISTANCE] * 2, rel=0.1)
 
 
 def test_the_mask_loss_is_finite_without_any_density():

@@ -36,7 +36,7 @@ MAX_SHARE = 8.0
 """Largest share of the steps of the settings. The effect of more steps was not measured."""
 TRUSTED_STEPS = 40
 """Weight of the trial's measurement in the mean time of a step, in steps of the run."""
-SPARE = 1.15
+SPARE_FACTOR = 1.15
 """Safety factor of the smallest budget that an error message names, because a trial is not exact."""
 
 
@@ -132,7 +132,7 @@ def steps_for(costs: Costs, share: float) -> dict[str, int]:
 
 def smallest_budget(costs: Costs, spent: float) -> float:
     """The smallest useful budget in seconds, rounded up to 5 s, or to 30 s from 3 minutes on."""
-    needed = SPARE * (spent + costs.once + MIN_SHARE * costs.all_steps)
+    needed = SPARE_FACTOR * (spent + costs.once + MIN_SHARE * costs.all_steps)
     unit = 5.0 if needed <= 180.0 else 30.0
     return unit * math.ceil(needed / unit)
 

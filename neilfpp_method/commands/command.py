@@ -13,10 +13,10 @@ from rich.console import Console
 
 __all__ = ["Checkpoint", "Command", "Device", "duration", "progress_bar", "terminal"]
 
-SOON = 10.0
-"""Estimated time above which a progress bar announces it, in seconds."""
-MEASURED = 2.0
-"""Seconds of progress from which the time of the whole work is estimated."""
+MIN_ANNOUNCED_SECONDS = 10.0
+"""Smallest estimate of the whole time, in seconds, that a progress bar prints."""
+MIN_MEASURED_SECONDS = 2.0
+"""Smallest time between two reports of progress, in seconds, from which the whole time is estimated."""
 
 Device = Annotated[str, tyro.conf.arg(metavar="cpu|cuda|cuda:N|auto")]
 """Type of an option that names a device."""
@@ -71,7 +71,7 @@ def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
 
     def advance(done: float) -> None:
         takes = pace.total(time.monotonic(), done)
-        if takes is not None and takes > SOON:
+        if takes is not None and takes > MIN_ANNOUNCED_SECONDS:
             progress.console.print(f"{title} takes about {duration(takes)}")
         progress.update(task, completed=done)
 
@@ -99,14 +99,17 @@ class _Pace:
     said: bool = False
 
     def total(self, now: float, done: float) -> float | None:
-        """Return the seconds of the whole work, once `MEASURED` seconds lie between two shares, else None."""
+        """Return the seconds of the whole work once, as soon as they can be estimated, and otherwise None.
+
+        They are estimated from two shares that are at least `MIN_MEASURED_SECONDS` apart.
+        """
         if self.said or done <= 0:
             return None
         if self.first is None:
             self.first = now, done
             return None
         since, at = self.first
-        if now - since < MEASURED or done <= at:
+        if now - since < MIN_MEASURED_SECONDS or done <= at:
             return None
         self.said = True
         return now - self.began + (1 - done) * (now - since) / (done - at)

@@ -15,7 +15,7 @@ __all__ = ["CLOSED_OUTPUT", "EndSignal", "ended_by_signal", "forget_interrupt", 
 
 CLOSED_OUTPUT = 141
 """The exit status that shells report for a process whose output is no longer read: 128 + SIGPIPE."""
-AGAIN = 0.05
+SECONDS_UNTIL_RAISED_AGAIN = 0.05
 """Time after which a signal whose exception was ignored is raised once more, in seconds."""
 
 
@@ -70,7 +70,7 @@ class EndSignal:
         if not self.number:
             self.hook(ignored)
         elif self._raises and issubclass(ignored.exc_type, KeyboardInterrupt):
-            self._again = threading.Timer(AGAIN, _interrupt, (self.number,))
+            self._again = threading.Timer(SECONDS_UNTIL_RAISED_AGAIN, _interrupt, (self.number,))
             self._again.daemon = True
             self._again.start()
 

@@ -65,7 +65,7 @@ UNUSABLE = (
     ),
 )
 
-FARTHEST = 1e6
+MAX_CAMERA_DISTANCE = 1e6
 """Largest distance of a camera from the scene box, in scene units; float32 has a step of 0.06 there."""
 BOX_SOURCES: Mapping[SceneSource, str] = {
     "box": ", as stated by the capture",
@@ -314,7 +314,7 @@ def _check_box(root: Path, files: CaptureFiles) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         shifts = np.stack([files.normalization.camera(view.camera).w2c[:3, 3] for view in files.views])
         distance = np.linalg.norm(shifts, axis=1).max()
-    if not distance <= FARTHEST:
+    if not distance <= MAX_CAMERA_DISTANCE:
         raise UserError(
             f"{root}: a camera is {distance:.3g} times the radius of the scene box away from it",
             "correct the centre and the radius of the scene box",

@@ -25,7 +25,7 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["SceneBox", "box_of_cameras", "box_of_focus", "box_of_points", "find_box"]
 
-OUTLIERS = 0.01
+OUTLIER_SHARE = 0.01
 """Share of the points that the box leaves out at either end of each axis."""
 MARGIN = 1.1
 """Ratio of the size of the box to the extent of its points."""
@@ -45,7 +45,7 @@ OFF_CENTER = 0.5
 """Distance of the middle of a box of points from the focus of the cameras, relative to the scale of the box,
 above which the box is discarded: a few points far behind the object have moved it to one side."""
 
-REACH = 0.55
+FOCUS_BOX_RADIUS = 0.55
 """Ratio of the radius of a box around the focus of the cameras to their median distance from it. Half of the
 cameras are then at least 1.8 scene units away, and a camera at three quarters of the median distance is 1.36
 away."""
@@ -99,13 +99,13 @@ def box_of_points(points: Float64[np.ndarray, "P 3"]) -> Normalization:
     Raises:
         UserError: all points are equal.
     """
-    low, high = np.quantile(points, [OUTLIERS, 1 - OUTLIERS], axis=0)
+    low, high = np.quantile(points, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
     return _box(low, high)
 
 
 def box_of_focus(views: Sequence[View]) -> Normalization | None:
-    """Return a ball around the point that most cameras look at, with `REACH` of their median distance as
-    radius.
+    """Return a ball around the point that most cameras look at, with a radius of `FOCUS_BOX_RADIUS` times
+    their median distance from it.
 
     Returns None if there is no such point (`find_focus`).
     """
@@ -113,7 +113,7 @@ def box_of_focus(views: Sequence[View]) -> Normalization | None:
     if focus is None:
         return None
     x, y, z = map(float, focus.center)
-    return Normalization(REACH * focus.distance, (x, y, z))
+    return Normalization(FOCUS_BOX_RADIUS * focus.distance, (x, y, z))
 
 
 def box_of_cameras(views: Sequence[View], fill: float = 1.0) -> Normalization:

@@ -58,8 +58,8 @@ DIRECT, REFLECTED, OVERALL = 0.3, 0.2, 1.0
 which is smaller because cameras observe those surfaces; and a common factor on all light from outside, which
 the images do not determine.
 """
-KNOWN = 0.05
-"""Relative standard deviation of light from outside if the environment map was given."""
+KNOWN_MAP_DEVIATION = 0.05
+"""Relative standard deviation of light from outside the scene if the environment map was given."""
 PIXELS = 1024
 """Number of training pixels from which `TrainingResiduals` are computed."""
 PRIOR_VIEWS = 1
@@ -87,7 +87,7 @@ class TrainingResiduals:
     Attributes:
         views: the training views.
         noise: median absolute relative error of radiance over pixels. The error is divided by the observed
-            radiance plus a fraction of the typical radiance (`lighting.objective.FLOOR`).
+            radiance plus a fraction of the typical radiance (`lighting.objective.ERROR_FLOOR`).
         misfit: median over points of the root mean square relative error over the views of a point.
         typical: share of the diffuse light that comes from each of K patches, per colour channel, averaged
             over points.
@@ -300,7 +300,7 @@ def _mean_over_views(values: Float[Tensor, "N V 3"], sightings: Sightings) -> Fl
 def _light_deviations(model: NeilfModel) -> Float[Tensor, " E"]:
     """Relative standard deviations of the light: one for each patch, then that of the common factor."""
     known = model.config.known_map is not None
-    direct, overall = (KNOWN, KNOWN) if known else (DIRECT, OVERALL)
+    direct, overall = (KNOWN_MAP_DEVIATION, KNOWN_MAP_DEVIATION) if known else (DIRECT, OVERALL)
     lamps = patch_count(model) - 2 * PATCHES
     return torch.tensor([direct] * PATCHES + [REFLECTED] * PATCHES + [DIRECT] * lamps + [overall])
 

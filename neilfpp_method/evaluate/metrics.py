@@ -32,7 +32,7 @@ __all__ = [
     "ssim",
 ]
 
-PERFECT = 1e-10
+MIN_RELATIVE_ERROR = 1e-10
 """Lower bound of mean squared error over squared peak. A perfect estimate then scores 100 dB instead of
 infinity, which JSON cannot hold.
 """
@@ -122,7 +122,7 @@ def _squared_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def decibels(squared_error: float, peak: float = 1.0) -> float:
     """Peak signal-to-noise ratio of a mean squared error, dB; at most 100 dB."""
-    return float(-10.0 * np.log10(max(squared_error / peak**2, PERFECT)))
+    return float(-10.0 * np.log10(max(squared_error / peak**2, MIN_RELATIVE_ERROR)))
 
 
 # -------------------------------------------------------------------------------------------------- alignment

@@ -45,7 +45,7 @@ from neilfpp_method.train.run import Run
 
 __all__ = ["evaluate", "protocol", "write_metrics"]
 
-RENDERING = 0.9
+RENDERING_SHARE = 0.9
 """Fraction of the progress that rendering the test views takes."""
 
 
@@ -72,7 +72,7 @@ def evaluate(
         run = load_run(Path("runs/teapot"), "cpu")
         write_metrics(run.path / "metrics.json", run, evaluate(run))
     """
-    rendered = rendered or render_test_views(run, lambda share: on_progress(RENDERING * share))
+    rendered = rendered or render_test_views(run, lambda share: on_progress(RENDERING_SHARE * share))
     known = known_test_views(run, rendered)
     pairs = [(r, k) for r, k in zip(rendered, known.views, strict=True) if k.mask.any()]
     figures = image_metrics(run, pairs) | material_metrics(run, pairs) | normal_metrics(pairs)

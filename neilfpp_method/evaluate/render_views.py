@@ -18,7 +18,7 @@ __all__ = ["finished_views", "render_run"]
 
 LAYERS = {"normal": "XYZ"}
 """Channel names of EXR layers that are not RGB."""
-RENDERING = 0.95
+RENDERING_SHARE = 0.95
 """Fraction of the progress of a view that rendering takes; the rest is for writing."""
 
 
@@ -64,7 +64,7 @@ def render_run(
         if view.name not in kept:
             done = len(written) - 1
             rendered = render_view(
-                run, i, lambda share, done=done: on_progress((done + RENDERING * share) / len(names))
+                run, i, lambda share, done=done: on_progress((done + RENDERING_SHARE * share) / len(names))
             )
             _write(rendered if residuals is None else with_deviation(run, residuals, rendered), out)
         on_progress(len(written) / len(names))

@@ -208,7 +208,7 @@ def _image(values: Shaped[Tensor, "P ..."], view: View) -> Shaped[np.ndarray, "H
 
 # ------------------------------------------------------------------------------- observed colours of surfaces
 
-VISIBLE = 0.02
+MAX_DEPTH_DIFFERENCE = 0.02
 """A view sees a point if its depth map, at the point's pixel, differs by at most this, scene units."""
 
 
@@ -241,7 +241,7 @@ def mean_observed_color(capture: Capture, points: Float[Tensor, "P 3"]) -> Float
     for i, view in enumerate(views):
         projected = project(capture.scene_camera(view), points)
         index = pixel_index(projected, view.camera)
-        same_depth = (truth.depth(view)[index] - projected.depth).abs() <= VISIBLE
+        same_depth = (truth.depth(view)[index] - projected.depth).abs() <= MAX_DEPTH_DIFFERENCE
         visible = (index >= 0) & pixels.valid(i)[index] & same_depth
         color = pixels.view(i, gradients=False).color[index]
         total += visible[:, None] * (color if capture.hdr else srgb_to_linear(color))

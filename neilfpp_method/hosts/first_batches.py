@@ -13,7 +13,12 @@ import torch
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.hosts.other_viewpoints import CLOSE, SAME_POINT, OtherViewpoints, other_viewpoints
+from neilfpp_method.hosts.other_viewpoints import (
+    SAME_POINT,
+    START_DISTANCE,
+    OtherViewpoints,
+    other_viewpoints,
+)
 from neilfpp_method.hosts.outputs import MAX_MEDIAN_DISTANCE
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.shading.color import apply_response
@@ -23,11 +28,11 @@ __all__ = ["FirstBatches"]
 
 BATCHES = 10
 """Number of batches that are checked; each check synchronises with the device."""
-UNIT = 1e-3
+UNIT_TOLERANCE = 1e-3
 """Largest difference of the length of a direction from 1."""
 OFF_RAY = 0.02
 """Distance of a hit from its ray, relative to its distance from the origin of the ray, above which the hit is
-wrong. `check_host` permits half of it, but of no hit more.
+wrong. `check_host` permits only half of it, and no exceptions.
 """
 MAX_WRONG_SHARE = 0.5
 """Largest permitted share of hits that are off their rays or have normals that face away from the viewer.
@@ -96,7 +101,7 @@ class FirstBatches:
             return
         length = batch.directions.norm(dim=-1)
         worst = (length - 1.0).abs().max().item() if len(batch) else 0.0
-        if not worst <= UNIT:
+        if not worst <= UNIT_TOLERANCE:
             raise UserError(
                 f"ray directions are not unit vectors: their lengths are between {length.min():.3g} and "
                 f"{length.max():.3g}",
@@ -232,12 +237,12 @@ class FirstBatches:
                 "have no surface yet",
             )
         elif self.traced_by_host:
-            moved = self._share_moved(others, torch.full_like(others.distance, CLOSE), render)
+            moved = self._share_moved(others, torch.full_like(others.distance, START_DISTANCE), render)
             if moved > MAX_MOVED_SHARE:
                 self._warn(
                     "near plane",
-                    f"{moved:.0%} of its hits are lost when seen from {CLOSE} away, and so is the light that "
-                    "surfaces close to each other exchange",
+                    f"{moved:.0%} of its hits are lost when seen from {START_DISTANCE} away, and so is "
+                    "the light that surfaces close to each other exchange",
                     "render rays that start on a surface without a near plane, or set inter_reflection.mode "
                     "to 'hard', so that a proxy of the surface traces them (docs/hosts.md)",
                 )

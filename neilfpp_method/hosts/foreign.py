@@ -35,7 +35,7 @@ PASSED_ON = (
     "scene_light",
 )
 """Optional methods of `hosts.base` that are forwarded to the host unchanged."""
-COARSE = (torch.float16, torch.bfloat16)
+COARSE_TYPES = (torch.float16, torch.bfloat16)
 """Types that are too coarse for positions."""
 
 log = logging.getLogger(__name__)
@@ -154,7 +154,7 @@ class ForeignHost(nn.Module):
 
     def _precise(self, rays: RayBatch, hits: SurfaceHits, depth: Tensor | None) -> SurfaceHits:
         for name, value in (("position", hits.position), ("depth", depth)):
-            if value is not None and value.dtype in COARSE and not self.warned_of_precision:
+            if value is not None and value.dtype in COARSE_TYPES and not self.warned_of_precision:
                 self.warned_of_precision = True
                 log.warning(
                     "%s: its %s is %s, whose relative precision is %.0e; return %ss in float32",

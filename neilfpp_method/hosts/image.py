@@ -24,9 +24,9 @@ from neilfpp_method.structures import RayBatch, SurfaceHits
 
 __all__ = ["depth_normals", "image_hits", "rays_like"]
 
-JUMP = 0.1
+MIN_RELATIVE_JUMP = 0.1
 """Relative difference of their distances above which neighbouring pixels belong to two surfaces."""
-SOLID = 0.5
+MIN_SOLID_OPACITY = 0.5
 """Smallest opacity of a pixel that shows a surface."""
 
 
@@ -77,7 +77,7 @@ def image_hits(
     position = rays.origins + distance[:, None] * rays.directions
     if normal is None:
         normal = depth_normals(position.view(*size, 3), rays.origins[0])
-    solid = opacity.detach().reshape(-1) > SOLID
+    solid = opacity.detach().reshape(-1) > MIN_SOLID_OPACITY
     unit = safe_normalize(normal.reshape(-1, 3)) * solid[:, None]
     has_normal = unit.detach().norm(dim=-1) > 0.5  # the length is 1, or 0 where no normal is known
     hit = solid & has_normal
@@ -121,4 +121,4 @@ def _nearer_step(position: Float[Tensor, "H W 3"], distance: Float[Tensor, "H W"
     fall = (distance - distance.roll(1, axis)).abs()
     fall = torch.where(edge == 0, torch.inf, fall)
     offset = torch.where((rise <= fall)[..., None], forward, backward)
-    return _Step(offset, torch.minimum(rise, fall) < JUMP * distance)
+    return _Step(offset, torch.minimum(rise, fall) < MIN_RELATIVE_JUMP * distance)

@@ -39,7 +39,7 @@ SAME_MESH = 1e-6
 """Difference of fingerprints up to which two meshes are the same. Rounding on another processor changes them
 by about 1e-8.
 """
-CREASE = math.radians(40)
+CREASE_ANGLE = math.radians(40)
 """Angle between the normals of two faces above which their common edge is sharp; otherwise normals are
 interpolated across it.
 """
@@ -216,9 +216,9 @@ def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "
     """Unit normals at the corners of faces, for interpolation within faces.
 
     The normal of a corner is the mean over the faces around its vertex that are connected to its face without
-    crossing a sharp edge (`CREASE`). Faces are weighted by their angle at the vertex, so that the mean does
-    not depend on the triangulation (Thürmer and Wüthrich 1998). Faces that do not share their vertices are
-    not connected.
+    crossing a sharp edge (`CREASE_ANGLE`). Faces are weighted by their angle at the vertex, so that the mean
+    does not depend on the triangulation (Thürmer and Wüthrich 1998). Faces that do not share their vertices
+    are not connected.
 
     Args:
         mesh: the triangles.
@@ -228,7 +228,7 @@ def corner_normals(mesh: Mesh, outward: Float[Tensor, "F 3"]) -> Float[Tensor, "
     shape = trimesh.Trimesh(mesh.vertices.numpy(), faces, process=False)
     pair, ends = shape.face_adjacency, shape.face_adjacency_edges
     first, second = outward.numpy()[pair].swapaxes(0, 1)
-    smooth = (first * second).sum(-1) > math.cos(CREASE)
+    smooth = (first * second).sum(-1) > math.cos(CREASE_ANGLE)
     pair, ends = pair[smooth], ends[smooth]
     # Corners at the same vertex, in two faces that share a smooth edge, belong to one group.
     slot = (faces[pair][:, :, None] == ends[:, None, :, None]).argmax(-1)

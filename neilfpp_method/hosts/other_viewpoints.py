@@ -11,13 +11,13 @@ from torch.nn.functional import normalize
 
 from neilfpp_method.structures import OrientedPoints, RayBatch
 
-__all__ = ["CLOSE", "SAME_POINT", "OtherViewpoints", "other_viewpoints"]
+__all__ = ["SAME_POINT", "START_DISTANCE", "OtherViewpoints", "other_viewpoints"]
 
 SAME_POINT = 0.01
 """Largest distance between the hits of one point from two viewpoints, scene units."""
-CLOSE = 0.05
+START_DISTANCE = 0.05
 """Distance from a point at which rays start in the search for a near plane, scene units."""
-TANGENT = 0.6
+VIEWPOINT_TANGENT = 0.6
 """Tangent of the angle between the other viewpoint and the direction halfway between normal and viewer."""
 
 
@@ -52,5 +52,5 @@ def other_viewpoints(rays: RayBatch, points: OrientedPoints) -> OtherViewpoints:
     return OtherViewpoints(
         position=points.position,
         distance=(points.position - rays.origins).norm(dim=-1),
-        direction=normalize(points.normal + to_viewer + TANGENT * tangent, dim=-1),
+        direction=normalize(points.normal + to_viewer + VIEWPOINT_TANGENT * tangent, dim=-1),
     )

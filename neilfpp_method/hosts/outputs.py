@@ -16,7 +16,7 @@ __all__ = ["MAX_MEDIAN_DISTANCE", "OutputCheck", "check_normals", "check_tensors
 
 SHAPES = {"color": (3,), "position": (3,), "normal": (3,), "opacity": (), "concentration": ()}
 """Shape of one row of each output."""
-UNIT = 1e-2
+UNIT_TOLERANCE = 1e-2
 """Largest difference of the length of a normal from 1: blending in half precision loses some digits."""
 MAX_MEDIAN_DISTANCE = 1.5
 """Median distance of hits from the origin above which the scene is too large, scene units. An object in the
@@ -123,7 +123,7 @@ def check_normals(name: str, hits: SurfaceHits, hit_share: float) -> bool:
     # The normals of both faces of a thin sheet may cancel: zero normals are allowed unless most are zero.
     off = (length - 1.0).abs()
     wrong = off.where(length > 0.0, off.median()) if len(length) else off
-    if len(length) and wrong.max() > UNIT:
+    if len(length) and wrong.max() > UNIT_TOLERANCE:
         odd = length[wrong.argmax()].item()
         raise UserError(
             f"{name}: its normal is not a unit vector: that of a hit has the length {odd:.3g}",

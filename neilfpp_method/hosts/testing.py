@@ -31,11 +31,11 @@ __all__ = ["ContractBroken", "HostReport", "check_host"]
 
 OFF_RAY = 1e-2
 """Largest distance of a hit from its ray, relative to its distance from the origin of the ray."""
-FACING = 0.9
+MIN_FACING_SHARE = 0.9
 """Smallest share of hits whose normal must face the viewer; blended normals at silhouettes may face away."""
-CLIPPED = 0.01
+MAX_CLIPPED_SHARE = 0.01
 """Share of colour values of exactly 1, if that is their maximum, above which colours count as clipped."""
-FAR = 100.0
+FAR_DISTANCE = 100.0
 """Distance from which rays start that lead away from the scene, scene units."""
 
 
@@ -135,7 +135,8 @@ def _normals(case: Case) -> None:
     facing = (case.hits.normal.detach() * case.rays.directions).sum(-1)[case.hit] < 0.0
     share = facing.float().mean().item()
     case.require(
-        share >= FACING, f"{1.0 - share:.0%} of its normals point away from the viewer: turned inwards?"
+        share >= MIN_FACING_SHARE,
+        f"{1.0 - share:.0%} of its normals point away from the viewer: turned inwards?",
     )
 
 
@@ -156,7 +157,7 @@ def _colors(case: Case) -> None:
     case.require((color >= 0.0).all(), "its color is negative")
     colors = color[case.hit]
     clipped = (colors == 1.0).float().mean().item()
-    stops = colors.max() == 1.0 and CLIPPED < clipped < 1.0
+    stops = colors.max() == 1.0 and MAX_CLIPPED_SHARE < clipped < 1.0
     case.require(
         not stops, f"{clipped:.0%} of its colors are exactly 1 and none is above: return them unclipped"
     )
@@ -164,7 +165,7 @@ def _colors(case: Case) -> None:
 
 def _misses(case: Case) -> None:
     outward = -case.rays.directions
-    away = RayBatch(case.rays.origins + FAR * outward, outward)
+    away = RayBatch(case.rays.origins + FAR_DISTANCE * outward, outward)
     missed = render_checked(case.host, away)
     for field in fields(SurfaceHits):
         finite = getattr(missed, field.name).isfinite().all()

@@ -16,7 +16,7 @@ MAX_CHANGE = 0.005
 """Largest permitted median change of positions between two calls, in scene units. The width of the soft layer
 is added to it.
 """
-SPREAD = 3.0
+MAX_RELATIVE_DIFFERENCE = 3.0
 """Largest permitted difference between a ray rendered in a part of a batch and in the whole batch, relative
 to the difference between two calls.
 """
@@ -49,7 +49,7 @@ def _independent_of_batch(case: Case) -> None:
         for name in ("color", "position", "normal", "opacity"):
             together = getattr(whole, name)[rows]
             noise = (getattr(whole, name) - getattr(other, name)).abs().mean()
-            room = SPREAD * noise + 1e-4 + 1e-3 * together.abs().mean()
+            room = MAX_RELATIVE_DIFFERENCE * noise + 1e-4 + 1e-3 * together.abs().mean()
             off = (getattr(part, name) - together).abs().mean()
             case.require(off <= room, f"its {name} of a ray depends on which other rays are in the batch")
 

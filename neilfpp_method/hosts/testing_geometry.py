@@ -9,7 +9,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from neilfpp_method.hosts.other_viewpoints import CLOSE, SAME_POINT, OtherViewpoints, other_viewpoints
+from neilfpp_method.hosts.other_viewpoints import (
+    SAME_POINT,
+    START_DISTANCE,
+    OtherViewpoints,
+    other_viewpoints,
+)
 from neilfpp_method.hosts.outputs import MAX_MEDIAN_DISTANCE
 from neilfpp_method.hosts.testing_case import HIT_SHARE, Case
 from neilfpp_method.structures import OrientedPoints, RayBatch
@@ -47,9 +52,9 @@ def _from_afar(case: Case) -> None:
 
 def _from_close_by(case: Case) -> None:
     others = _other_viewpoints(case)
-    rays = others.rays(torch.full_like(others.distance, CLOSE))
+    rays = others.rays(torch.full_like(others.distance, START_DISTANCE))
     suspect = "light between surfaces would not see it (a near plane?)"
-    _require_same_hits(case, others.position, rays, f"{CLOSE} away", suspect)
+    _require_same_hits(case, others.position, rays, f"{START_DISTANCE} away", suspect)
 
 
 def _normals_of_neighbors(case: Case) -> None:

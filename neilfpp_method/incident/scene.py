@@ -19,7 +19,8 @@ height h still crosses the optical depth exp(−h/β) / (2 cos θ): at 4 β that
 """
 
 MIN_COSINE = 0.1
-"""Lower bound on cos θ in the displacement of the start; it acts within 6° of the surface."""
+"""Lower bound on cos θ in the displacement of the start; it matters for rays within 6° of the
+surface."""
 
 RAYS_AT_ONCE = 2048
 """Number of rays per batch for a host without cheap tracing; limits memory."""

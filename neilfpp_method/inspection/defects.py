@@ -36,9 +36,9 @@ __all__ = [
 
 Severity = Literal["problem", "warning"]
 
-JUMP = 1.5
+MIN_BRIGHTNESS_RATIO = 1.5
 """Smallest ratio of the brightness of a view to that of its neighbours, or its inverse, that is reported."""
-BLURRED = 0.4
+MAX_BLURRED_RATIO = 0.4
 """Ratio of the sharpness of a view to that of the others, below which it is blurred."""
 CLIPPED_VIEW = 0.01
 """Share of clipped pixels above which a view is reported."""
@@ -46,7 +46,7 @@ INVALID_VIEW = 0.5
 """Share of invalid pixels above which a view is reported."""
 MIN_COUNT, ADVISED_COUNT = 3, 16
 """Fewer views than the first are a problem, fewer than the second a warning."""
-BASELINE = 0.02
+MIN_CAMERA_EXTENT = 0.02
 """Extent of the camera centres below which all cameras are at one place, as a share of their median distance
 from the centre or, if they are within the unit sphere, in scene units. The object then moves by about 20
 pixels between views of 1000 pixels.
@@ -218,7 +218,7 @@ def _exposure_defects(
 ) -> Iterator[Defect]:
     """Views that are brighter or darker than the views around them."""
     pairs = zip(views, factors, strict=True)
-    jumps = {view.name: factor for view, factor in pairs if max(factor, 1 / factor) > JUMP}
+    jumps = {view.name: factor for view, factor in pairs if max(factor, 1 / factor) > MIN_BRIGHTNESS_RATIO}
     if jumps:
         named = _listed([f"{name} ×{factor:.2g}" for name, factor in jumps.items()], max_parts=4)
         text = f"brighter or darker than the views around them: {named}"
@@ -230,8 +230,8 @@ def _exposure_defects(
 def _image_defects(views: Sequence[ViewFigures]) -> Iterator[Defect]:
     """Pictures that add nothing: blurred ones and duplicates."""
     sharp = np.median([view.sharpness for view in views if view.sharpness > 0] or [0.0])
-    if blurred := [view for view in views if 0 < view.sharpness < BLURRED * sharp]:
-        text = f"blurred: less than {100 * BLURRED:.0f} % of the usual fine detail"
+    if blurred := [view for view in views if 0 < view.sharpness < MAX_BLURRED_RATIO * sharp]:
+        text = f"blurred: less than {100 * MAX_BLURRED_RATIO:.0f} % of the usual fine detail"
         remedy = "leave these views out, or take them again"
         yield Defect("blurred", "warning", text, remedy, _names(blurred))
     if pairs := duplicates([view.small for view in views]) if views else ():
@@ -285,7 +285,7 @@ def _camera_defects(capture: Capture, placement: CameraPlacement) -> Iterator[De
         remedy = f"take {ADVISED_COUNT} or more, better 50, from all around"
         yield Defect("few_views", severity, f"{count} view{'s' * (count != 1)}", remedy)
     distance = max(1.0, float(np.median(np.linalg.norm(placement.centers, axis=1))))
-    if count > 1 and np.ptp(placement.centers, axis=0).max() < BASELINE * distance:
+    if count > 1 and np.ptp(placement.centers, axis=0).max() < MIN_CAMERA_EXTENT * distance:
         text = "all cameras are at one place, so the images hardly determine the geometry"
         yield Defect("one_place", "problem", text, "take photographs from several sides")
     if count >= MIN_COUNT and placement.coverage < MIN_COVERAGE:

@@ -28,7 +28,7 @@ MIDDLE_GRAY = 0.18
 """Linear value to which the luminance of the object is scaled before sharpness is measured."""
 DARK = 1e-3
 """Luminance below which a pixel counts as black, relative to the mean of the object."""
-FULL = 254.5 / 255
+CLIPPED_VALUE = 254.5 / 255
 """Display value from which a pixel counts as clipped."""
 PLATEAU_WIDTH = 1e-4
 """Relative distance from the maximum of a linear image within which a pixel counts as at the maximum."""
@@ -158,7 +158,7 @@ def _clipped(image: ImageFile, color: Float32[np.ndarray, "H W 3"], chosen: Bool
     if not len(pixels):
         return 0.0
     if not image.hdr:
-        return float((image.pixels[chosen] >= FULL).any(axis=-1).mean())
+        return float((image.pixels[chosen] >= CLIPPED_VALUE).any(axis=-1).mean())
     # Clipping of a sensor gives many pixels the same level; without it, few pixels share the maximum.
     top = pixels >= pixels.max(axis=0) * (1 - PLATEAU_WIDTH)
     piled = (top.sum(axis=0) >= MIN_CLIPPED) & (pixels.max(axis=0) > pixels.min(axis=0))

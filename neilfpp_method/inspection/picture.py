@@ -21,11 +21,11 @@ CELL, LABEL, GAP, MARGIN = 160, 40, 12, 32
 """Side of a view, height of its label, space between views, and margin of the sheet, in pixels."""
 COLUMNS = 7
 """Number of views in a row."""
-PLAN = 420
+PLAN_SIDE = 420
 """Side of each plot of the camera positions, in pixels."""
 MAX_DRAWN = 210
 """Largest number of views in the picture."""
-KEY = 0.25
+DISPLAYED_MEDIAN = 0.25
 """Linear value to which the median luminance of the capture is scaled for display."""
 
 
@@ -35,7 +35,7 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
     order = sorted(range(len(colors)), key=lambda i: SEVEREST_FIRST.index(colors[i]))[:MAX_DRAWN]
     rows = -(-len(order) // COLUMNS)
     width = 2 * MARGIN + COLUMNS * (CELL + GAP) - GAP
-    top = MARGIN + 70 + PLAN + 2 * GAP
+    top = MARGIN + 70 + PLAN_SIDE + 2 * GAP
     sheet = Image.new("RGB", (width, top + rows * (CELL + LABEL + GAP) + MARGIN), PAPER)
     pen = ImageDraw.Draw(sheet)
     radiance, capture = inspection.radiance, inspection.capture
@@ -43,9 +43,11 @@ def draw(inspection: Inspection) -> UInt8[np.ndarray, "H W 3"]:
     write(pen, (MARGIN, MARGIN + 32), f"radiance {radiance.level}: {radiance.text}", 16, PALE_INK)
     for k, (axes, title) in enumerate([((0, 1), "along z (x, y)"), ((0, 2), "along y (x, z)")]):
         plan = Image.fromarray(_plan(inspection, axes, colors, title))
-        sheet.paste(plan, (MARGIN + k * (PLAN + 2 * GAP), MARGIN + 70))
-    _list(pen, (MARGIN + 2 * (PLAN + 2 * GAP), MARGIN + 78), inspection)
-    exposure = KEY / float(np.median([v.luminance for v in inspection.views if v.luminance > 0] or [1.0]))
+        sheet.paste(plan, (MARGIN + k * (PLAN_SIDE + 2 * GAP), MARGIN + 70))
+    _list(pen, (MARGIN + 2 * (PLAN_SIDE + 2 * GAP), MARGIN + 78), inspection)
+    exposure = DISPLAYED_MEDIAN / float(
+        np.median([v.luminance for v in inspection.views if v.luminance > 0] or [1.0])
+    )
     for place, i in enumerate(order):
         corner = (MARGIN + place % COLUMNS * (CELL + GAP), top + place // COLUMNS * (CELL + LABEL + GAP))
         view = inspection.views[i]
@@ -71,13 +73,13 @@ def _plan(
     inspection: Inspection, axes: tuple[int, int], colors: list[Color], title: str
 ) -> UInt8[np.ndarray, "_ _ 3"]:
     """Plot cameras as dots with viewing directions, projected along a world axis, with the unit sphere."""
-    plan = Image.new("RGB", (PLAN, PLAN), (255, 255, 255))
+    plan = Image.new("RGB", (PLAN_SIDE, PLAN_SIDE), (255, 255, 255))
     pen = ImageDraw.Draw(plan)
     centers, forward = inspection.placement.centers[:, axes], inspection.placement.axes[:, axes]
     reach = 1.15 * max(1.0, float(np.abs(centers).max()))
 
     def place(points: Float64[np.ndarray, "*N 2"]) -> Float64[np.ndarray, "*N 2"]:
-        return PLAN / 2 * (1 + points / reach * np.array([1, -1]))
+        return PLAN_SIDE / 2 * (1 + points / reach * np.array([1, -1]))
 
     pen.ellipse([*place(np.array([-1.0, 1.0])), *place(np.array([1.0, -1.0]))], outline=PALE_INK)
     for start, end, color in zip(

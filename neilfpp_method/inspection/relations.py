@@ -19,17 +19,17 @@ NEIGHBORS = 6
 """Number of views, nearest in pose, with which a view is compared."""
 THUMBNAIL = (32, 32)
 """Width and height of the thumbnails that are compared, in pixels."""
-NEAR = 0.85
+MAX_POSE_DISTANCE = 0.85
 """Distance of two poses beyond which they are not compared: about 35° around the centre. Views farther apart
 may show a bright and a dark side of the object.
 """
-SAME = 0.02
+MAX_DUPLICATE_DIFFERENCE = 0.02
 """Root mean square difference of standardised thumbnails below which two views are duplicates."""
-LIT = 0.99
+LIT_QUANTILE = 0.99
 """Quantile of the lit pixels of a picture above which brightness is clipped before pictures are compared."""
 SEEN_ANGLE = 30.0
 """Largest angle between a covered direction and the nearest view, in degrees."""
-SPHERE = 1000
+SPHERE_DIRECTIONS = 1000
 """Number of sampled directions of the sphere."""
 
 
@@ -79,8 +79,8 @@ def camera_placement(capture: Capture) -> CameraPlacement:
 
 def _lattice() -> Float64[np.ndarray, "S 3"]:
     """Evenly distributed directions: the Fibonacci lattice."""
-    k = np.arange(SPHERE) + 0.5
-    z, azimuth = 1 - 2 * k / SPHERE, k * np.pi * (3 - np.sqrt(5))
+    k = np.arange(SPHERE_DIRECTIONS) + 0.5
+    z, azimuth = 1 - 2 * k / SPHERE_DIRECTIONS, k * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z**2)
     return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=1)
 
@@ -105,7 +105,7 @@ def exposure_factors(luminances: Sequence[float], placement: CameraPlacement) ->
     factors = np.ones(len(light))
     for i in np.flatnonzero(nonzero):
         distance = np.linalg.norm(pose - pose[i], axis=1)
-        near = np.flatnonzero(nonzero & (distance < NEAR) & (np.arange(len(light)) != i))
+        near = np.flatnonzero(nonzero & (distance < MAX_POSE_DISTANCE) & (np.arange(len(light)) != i))
         if len(near):
             factors[i] = light[i] / np.median(light[near[np.argsort(distance[near])[:NEIGHBORS]]])
     return factors
@@ -118,7 +118,7 @@ def _gray(picture: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     """
     gray = picture.mean(axis=-1)
     lit = gray[gray > 0]
-    return np.minimum(gray, np.quantile(lit, LIT)) if lit.size else gray
+    return np.minimum(gray, np.quantile(lit, LIT_QUANTILE)) if lit.size else gray
 
 
 def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[int, int], ...]:
@@ -134,5 +134,9 @@ def duplicates(pictures: Sequence[Float[np.ndarray, "_ _ 3"]]) -> tuple[tuple[in
     spread = flat.std(axis=1)
     flat = (flat - flat.mean(axis=1, keepdims=True)) / np.maximum(spread, 1e-9)[:, None]
     # The mean squared difference of two standardised pictures is 2 (1 − correlation).
-    alike = (flat @ flat.T / flat.shape[1] > 1 - SAME**2 / 2) & (spread > 0)[:, None] & (spread > 0)
+    alike = (
+        (flat @ flat.T / flat.shape[1] > 1 - MAX_DUPLICATE_DIFFERENCE**2 / 2)
+        & (spread > 0)[:, None]
+        & (spread > 0)
+    )
     return tuple((int(i), int(j)) for i, j in np.argwhere(np.triu(alike, 1)))

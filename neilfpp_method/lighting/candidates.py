@@ -13,7 +13,7 @@ from neilfpp_method.shading.frame import safe_normalize
 
 __all__ = ["FoundLamps", "merge_lamps", "propose"]
 
-REACH = 1.25
+MAX_RADIUS = 1.25
 """Largest distance of a candidate from the scene's centre, in scene units. The object lies in the unit
 sphere, and a light that is much farther away looks the same from every point of it.
 """
@@ -31,7 +31,7 @@ MIN_MEAN_AXIS = 0.5
 """Merged candidates become a panel if their mean axis is longer than this, otherwise a bulb."""
 MERGE_DISTANCE = 0.2
 """Candidates within this distance of a stronger one are merged with it, in scene units."""
-STEP = 0.06
+CLONE_OFFSET = 0.06
 """Standard deviation of the offset of a clone from its lamp, per axis, in scene units."""
 MIN_LAMP_SHARE = 0.02
 """A lamp with less than this share of the light of all lamps is dropped."""
@@ -65,10 +65,10 @@ def propose(lamps: Lamps, surface: Float[Tensor, "N 3"], count: int) -> LampPlac
     """
     lit = lamps.lit_places
     moved = lit.position.repeat_interleave(CLONES, 0)
-    moved = moved + STEP * torch.randn_like(moved)
+    moved = moved + CLONE_OFFSET * torch.randn_like(moved)
     # About half of the points of a cube lie in its ball, and some of those are too close to the surface.
-    anywhere = REACH * (2 * torch.rand(6 * count, 3, device=surface.device, dtype=surface.dtype) - 1)
-    guesses = torch.cat((moved, anywhere[anywhere.norm(dim=-1) < REACH]))
+    anywhere = MAX_RADIUS * (2 * torch.rand(6 * count, 3, device=surface.device, dtype=surface.dtype) - 1)
+    guesses = torch.cat((moved, anywhere[anywhere.norm(dim=-1) < MAX_RADIUS]))
     clear = torch.cdist(guesses, surface).amin(-1) > CLEARANCE * lamps.radius
     guesses = guesses[clear]
     turned = safe_normalize(safe_normalize(-guesses) + AXIS_SPREAD * torch.randn_like(guesses))

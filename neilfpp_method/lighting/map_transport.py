@@ -55,14 +55,14 @@ class TexelRays:
         number: index of the texel.
         weight: cosine times solid angle of the texel.
         texels: number of texels of the map.
-        met: what the rays hit in the scene; None without a scene.
+        scene_light: the light that the rays meet in the scene, and which rays meet it; None without a scene.
     """
 
     wi: Float[Tensor, "N S 3"]
     number: Int[Tensor, "N S"]
     weight: Float[Tensor, "N S"]
     texels: int
-    met: SceneLight | None
+    scene_light: SceneLight | None
 
     @staticmethod
     def joined(parts: Sequence[TexelRays]) -> TexelRays:
@@ -70,13 +70,14 @@ class TexelRays:
         wi, number, weight = (
             torch.cat([getattr(part, name) for part in parts]) for name in ("wi", "number", "weight")
         )
-        met = None if parts[0].met is None else SceneLight.joined([part.met for part in parts])
-        return TexelRays(wi, number, weight, parts[0].texels, met)
+        lights = [part.scene_light for part in parts]
+        scene_light = None if lights[0] is None else SceneLight.joined(lights)
+        return TexelRays(wi, number, weight, parts[0].texels, scene_light)
 
     def __getitem__(self, points: Tensor) -> TexelRays:
         """The rays of some of the points."""
-        met = None if self.met is None else self.met[points]
-        return TexelRays(self.wi[points], self.number[points], self.weight[points], self.texels, met)
+        scene_light = None if self.scene_light is None else self.scene_light[points]
+        return TexelRays(self.wi[points], self.number[points], self.weight[points], self.texels, scene_light)
 
     def redrawn(self, environment: EnvironmentLight, observed: Observed) -> TexelRays:
         """The rays of N pixels with other directions in the same texels, and the same hits."""
@@ -87,12 +88,12 @@ class TexelRays:
 
     def transport(self, kernel: Float[Tensor, "K N S"]) -> Transport:
         """The transport through a kernel, which is the BRDF times `weight`."""
-        sent = kernel.new_zeros(*kernel.shape[:2], 3)
-        if self.met is not None:
-            sent = torch.einsum("kns,nsc->knc", kernel, self.met.radiance.to(kernel.dtype))
-            kernel = kernel * ~self.met.hit
+        from_scene = kernel.new_zeros(*kernel.shape[:2], 3)
+        if self.scene_light is not None:
+            from_scene = torch.einsum("kns,nsc->knc", kernel, self.scene_light.radiance.to(kernel.dtype))
+            kernel = kernel * ~self.scene_light.hit
         sources = kernel.new_zeros(*kernel.shape[:2], self.texels)
-        return Transport(sources.scatter_(2, self.number.expand(len(kernel), -1, -1), kernel), sent)
+        return Transport(sources.scatter_(2, self.number.expand(len(kernel), -1, -1), kernel), from_scene)
 
 
 def trace_texels(
@@ -109,5 +110,5 @@ def trace_texels(
     # horizon cuts).
     weight, number = weight.topk(texels // 2, dim=1)
     wi = drawn.wi.gather(1, number[..., None].expand(-1, -1, 3))
-    met = None if scene is None else scene(position, wi)
-    return TexelRays(wi, number, weight, texels, met)
+    scene_light = None if scene is None else scene(position, wi)
+    return TexelRays(wi, number, weight, texels, scene_light)

@@ -22,8 +22,8 @@ from neilfpp_method.structures import Indexable, Material
 
 __all__ = [
     "DARK_FLOOR",
+    "ERROR_FLOOR",
     "EVENNESS",
-    "FLOOR",
     "Objective",
     "Target",
     "error_unit",
@@ -34,11 +34,11 @@ __all__ = [
     "white_balance",
 ]
 
-FLOOR = 0.1
+ERROR_FLOOR = 0.1
 """This share of a typical pixel is added to the denominator of a relative error, because dark pixels are
 mostly noise.
 """
-OUTLIER = 0.1
+OUTLIER_ERROR = 0.1
 """Relative error at which the loss changes from quadratic to linear. There are points that no light explains,
 for example if the geometry is wrong there.
 """
@@ -46,7 +46,7 @@ SMOOTHNESS = 0.02
 """Weight of the total variation of the map's log radiance per texel, relative to the data term."""
 EVENNESS = 0.3
 """Weight of the mean difference of log base colour between neighbouring points, relative to the data term."""
-SKY = 1.0
+SKY_WEIGHT = 1.0
 """Weight, relative to the data term, of the deviation of the map's log radiance from what cameras saw of it
 directly. The weight is high because this observation is reliable and fixes the common scale of light and
 base colour.
@@ -151,14 +151,14 @@ class Objective:
     ) -> Float[Tensor, ""]:
         """The data term: the mean Huber loss of the relative error. Arguments as in `relative_error`."""
         error = self.relative_error(strength, transport, target, gain)
-        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER)
+        return functional.smooth_l1_loss(error, torch.zeros_like(error), beta=OUTLIER_ERROR)
 
     def map_prior(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """Priors on the map: smoothness, and agreement with what cameras saw of it directly."""
         uneven = SMOOTHNESS * total_variation(log_radiance)
         if self.sky is None or not log_radiance.numel():
             return uneven
-        return uneven + SKY * self.sky.misfit(log_radiance)
+        return uneven + SKY_WEIGHT * self.sky.misfit(log_radiance)
 
     def lamp_prior(
         self, contribution: Float[Tensor, " M"], all_light: Float[Tensor, " 3"]
@@ -185,7 +185,7 @@ def error_unit(pixel: Float[Tensor, "*B 3"], response: str, typical: float) -> F
         response: response of the capture, "linear" or "srgb".
         typical: change of a typical pixel per unit of log radiance (`response_slope`).
     """
-    return response_slope(pixel, response) + FLOOR * typical
+    return response_slope(pixel, response) + ERROR_FLOOR * typical
 
 
 def total_variation(values: Float[Tensor, "C H W"]) -> Float[Tensor, ""]:

@@ -24,10 +24,10 @@ HALF_WEIGHT_SPREAD = 0.3
 """Relative standard deviation of the luminance within a texel at which its weight is halved."""
 QUADRATIC_BELOW = 0.1
 """Difference of log radiance at which the loss changes from quadratic to linear."""
-MIN_SEEN = 0.2
+MIN_SEEN_SHARE = 0.2
 """Share of all directions that cameras must have seen so that they fix the scale of the light. In photographs
-of a toy, a castle and a tree trunk it was 0.5 to 5 %. Without another scale, the unseen light then got dimmer
-and the base colours brighter with every fit.
+of a toy, a castle and a tree trunk it was 0.5 to 5 %. With a free scale, the unseen light then got dimmer and
+the base colours brighter with every fit.
 """
 DARK_FLOOR = 1e-3
 """Texels are raised to at least this share of the mean radiance before the logarithm is taken."""
@@ -51,7 +51,7 @@ class KnownSky:
         rows = len(self.weight)
         # A row of the map covers a solid angle in proportion to the sine of its polar angle.
         solid_angle = torch.sin(math.pi * (torch.arange(rows) + 0.5) / rows).to(self.weight)
-        return bool(self.weight.mean(1) @ solid_angle > MIN_SEEN * solid_angle.sum())
+        return bool(self.weight.mean(1) @ solid_angle > MIN_SEEN_SHARE * solid_angle.sum())
 
     def misfit(self, log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, ""]:
         """Weighted Huber loss between a map and the observation, averaged over the texels."""

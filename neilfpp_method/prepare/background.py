@@ -13,7 +13,7 @@ from neilfpp_method.data.cameras.colmap_library import pycolmap
 __all__ = ["in_background", "sigterm_as_ctrl_c", "silent"]
 
 Result = TypeVar("Result")
-INTERVAL = 0.2
+UPDATE_SECONDS = 0.2
 """Seconds between two updates of the progress bar."""
 
 
@@ -24,7 +24,7 @@ def in_background(
 
     Args:
         call: a native call that observes the cancellation token.
-        update: called every `INTERVAL` seconds in the main thread while `call` runs, and once at the end.
+        update: called in the main thread every `UPDATE_SECONDS` while `call` runs, and once at the end.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed. `call` has been cancelled and has ended.
@@ -45,7 +45,7 @@ def in_background(
 
     threading.Thread(target=work, daemon=True).start()
     try:
-        while not ended.wait(INTERVAL):
+        while not ended.wait(UPDATE_SECONDS):
             update()
         update()
     except BaseException:

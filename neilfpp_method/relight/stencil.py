@@ -22,9 +22,9 @@ from neilfpp_method.relight.surface import Surface
 
 __all__ = ["Stencil", "masked_limit", "read_stencils"]
 
-NEAR = 2e-3
+MAX_DEPTH_BEHIND = 2e-3
 """A point is visible if it is at most this distance behind the first hit of its ray, scene units."""
-WHITE = 0.5
+MIN_WHITE = 0.5
 """Value from which a pixel counts as white."""
 
 
@@ -43,7 +43,9 @@ class Stencil:
         eye = torch.as_tensor(self.camera.c2w[:, 3], dtype=x.dtype, device=x.device)
         offset = x[rows] - eye
         distance = offset.norm(dim=-1)
-        occluded = surface.blocked(eye.expand_as(offset), offset / distance[:, None], distance - NEAR)
+        occluded = surface.blocked(
+            eye.expand_as(offset), offset / distance[:, None], distance - MAX_DEPTH_BEHIND
+        )
         covered[rows] = ~occluded
         return covered[:, None]
 
@@ -96,7 +98,7 @@ def _read(path: Path, capture: Capture) -> Stencil:
     white = torch.zeros(camera.height, camera.width, dtype=torch.bool)
     # Due to rounding, the heights of camera and mask may differ by one row.
     rows = min(camera.height, len(value))
-    white[:rows] = value[:rows] >= WHITE
+    white[:rows] = value[:rows] >= MIN_WHITE
     if not white.any():
         raise UserError(
             f"{path}: no pixel of the mask is white", "paint the pixels white at which the material changes"

@@ -31,7 +31,7 @@ from neilfpp_method.train.run import Run, load_run
 __all__ = ["REPORT", "ReportOptions", "write_report"]
 
 REPORT = "report.html"
-RENDERING = 0.85
+RENDERING_SHARE = 0.85
 """Fraction of the progress that rendering the views takes."""
 BEFORE_CHECKPOINT = "Training was stopped before its first checkpoint"
 """The reason why a report has no images."""
@@ -106,7 +106,7 @@ def _with_model(
     run: Run, files: RunFiles, options: ReportOptions, on_progress: Callable[[float], None]
 ) -> str:
     small = run_for_display(run, options.views, options.size)
-    views = encode_views(small, options.confidence, lambda share: on_progress(RENDERING * share))
+    views = encode_views(small, options.confidence, lambda share: on_progress(RENDERING_SHARE * share))
     light = (
         light_summary(run.config.light, read_fits(run.path, run.step))
         if run.has_material

@@ -196,7 +196,7 @@ class _Interrupted(NamedTuple):
 
 
 class timed(ContextDecorator):
-    """Mark the kind of work in a context, or in a decorated function, for the ledger that listens, if any.
+    """Mark the kind of work in a context, or in a decorated function, for the current ledger, if any.
 
     Args:
         work: the kind of work.

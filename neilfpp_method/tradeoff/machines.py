@@ -12,10 +12,11 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["parse_devices", "parse_slurm", "visible_gpu"]
 
-VISIBLE = "CUDA_VISIBLE_DEVICES"
+VISIBLE_DEVICES = "CUDA_VISIBLE_DEVICES"
+"""Environment variable that selects the GPUs that a process sees."""
 ONE_PROCESS = ("nodes", "ntasks_per_node", "tasks_per_node")
 """Slurm parameters that would start more than one process for a run."""
-LISTS = ("setup", "teardown", "srun_args")
+LIST_PARAMETERS = ("setup", "teardown", "srun_args")
 """Parameters of submitit that are lists."""
 
 
@@ -58,12 +59,14 @@ def visible_gpu(device: str) -> int:
         UserError: if that variable of this process has names in place of numbers.
     """
     number = int(device.removeprefix("cuda:"))
-    visible = os.environ.get(VISIBLE, "").replace(" ", "")
+    visible = os.environ.get(VISIBLE_DEVICES, "").replace(" ", "")
     if not visible:
         return number
     names = visible.split(",")
     if number >= len(names) or not names[number].isdigit():
-        raise UserError(f"{device}: {VISIBLE} is {visible}", f"set {VISIBLE} to numbers that include it")
+        raise UserError(
+            f"{device}: {VISIBLE_DEVICES} is {visible}", f"set {VISIBLE_DEVICES} to numbers that include it"
+        )
     return int(names[number])
 
 
@@ -88,7 +91,7 @@ def parse_slurm(text: str) -> dict[str, object]:
 
 
 def _value(name: str, value: str) -> object:
-    if name in LISTS:
+    if name in LIST_PARAMETERS:
         return [value]
     if value in ("true", "false"):
         return value == "true"

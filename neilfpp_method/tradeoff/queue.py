@@ -16,7 +16,7 @@ from neilfpp_method.tradeoff.planned_runs import PlannedRun
 
 __all__ = ["Engine", "Job", "ThisProcess", "work_through"]
 
-POLL = 0.5
+POLL_SECONDS = 0.5
 """Seconds between two looks at the running jobs."""
 
 
@@ -114,7 +114,7 @@ def work_through(
                 too_small = max(too_small, ending.too_small)
                 on_end(run, ending)
             if running and not ended:
-                time.sleep(POLL)
+                time.sleep(POLL_SECONDS)
     finally:
         if running:
             _stop([job for _, job in running.values()], say)
@@ -143,4 +143,4 @@ def _stop(jobs: Sequence[Job], say: Callable[[str], None]) -> None:
 
 def _wait(jobs: Sequence[Job]) -> None:
     while not all(job.done() for job in jobs):
-        time.sleep(POLL)
+        time.sleep(POLL_SECONDS)

@@ -33,9 +33,9 @@ JOB_FACTOR, JOB_MINUTES = 1.5, 30
 """A Slurm job may take this multiple of its budget and so many minutes more, for the start of the program,
 the metrics and relit views. `--slurm timeout_min=N` replaces this.
 """
-SHARED = ("timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node", "name", "stderr_to_stdout")
+COMMON_PARAMETERS = ("timeout_min", "mem_gb", "cpus_per_task", "gpus_per_node", "name", "stderr_to_stdout")
 """Parameters that submitit has for all clusters."""
-SUBMITIT = ("setup", "teardown", "srun_args", "use_srun", "signal_delay_s")
+SUBMITIT_PARAMETERS = ("setup", "teardown", "srun_args", "use_srun", "signal_delay_s")
 """Parameters of submitit for Slurm that are not options of sbatch."""
 STOPPED = "stopped; the same command continues it"
 
@@ -133,11 +133,11 @@ def _slurm_parameters(parameters: Mapping[str, object]) -> dict[str, object]:
     sbatch = {
         name.replace("_", "-"): value
         for name, value in parameters.items()
-        if name not in (*SHARED, *SUBMITIT)
+        if name not in (*COMMON_PARAMETERS, *SUBMITIT_PARAMETERS)
     }
     return {
-        **{name: value for name, value in parameters.items() if name in SHARED},
-        **{f"slurm_{name}": value for name, value in parameters.items() if name in SUBMITIT},
+        **{name: value for name, value in parameters.items() if name in COMMON_PARAMETERS},
+        **{f"slurm_{name}": value for name, value in parameters.items() if name in SUBMITIT_PARAMETERS},
         "slurm_additional_parameters": sbatch,
     }
 

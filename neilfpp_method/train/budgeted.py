@@ -9,7 +9,7 @@ from pathlib import Path
 from neilfpp_method.budget.durations import format_duration
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
-from neilfpp_method.effects.evidence.material import JUDGED
+from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
@@ -128,7 +128,7 @@ def planned_settings(plan: BudgetPlan, config: NeilfConfig) -> NeilfConfig:
 def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
     """Leave the effects that are measured at places as in the settings if there is no time to measure."""
     reason = f"not measured: that would take more than {PLACES_SHARE:.0%} of the budget"
-    for name in JUDGED:
+    for name in EFFECTS_AT_PLACES:
         if effects.is_open(name) and not plan.places_looked_at:
             effects.decisions.append(Decision(0, name, effects.is_on(name), "settings", reason))
     if effects.is_open(LONG_TAILS) and plan.light_pixels == 0:

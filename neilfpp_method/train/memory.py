@@ -12,10 +12,10 @@ from neilfpp_method.data.views import View
 
 __all__ = ["check_training_memory", "training_bytes"]
 
-READING = 48
+BYTES_PER_READ_PIXEL = 48
 """Bytes per pixel of the largest image file while it is decoded, linearised, averaged and encoded (estimate).
 """
-COUNTED = 3 * 8 / 1024
+INDEX_BYTES_PER_PIXEL = 3 * 8 / 1024
 """Bytes per pixel of all views for the index of three sets of pixels: 8 bytes per block of 1024."""
 BASE_BYTES = 0.8e9
 """Bytes of the libraries, the statistics of the images, and a model of preset `fast`."""
@@ -29,7 +29,7 @@ def training_bytes(views: Sequence[View]) -> int:
     """
     largest = max(math.prod(file_size(view)) for view in views)
     pixels = sum(view.camera.width * view.camera.height for view in views)
-    return int(BASE_BYTES + READING * largest + COUNTED * pixels)
+    return int(BASE_BYTES + BYTES_PER_READ_PIXEL * largest + INDEX_BYTES_PER_PIXEL * pixels)
 
 
 def check_training_memory(capture: Capture) -> None:

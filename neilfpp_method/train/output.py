@@ -10,7 +10,8 @@ from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["check_folder", "check_page", "check_writable", "default_folder"]
 
-PAGE = (".html", ".htm")
+PAGE_SUFFIXES = (".html", ".htm")
+"""Suffixes that the name of a page may have."""
 RECORDS = ("capture.json", "config.json", "effects.json", "environment.json", "scene.json", "split.json")
 """Names of files that describe a run or a capture, which a result must not replace."""
 
@@ -43,7 +44,7 @@ def check_page(path: Path) -> None:
         UserError: as `check_writable`, or the name has another suffix.
     """
     check_writable(path)
-    if path.suffix.lower() not in PAGE:
+    if path.suffix.lower() not in PAGE_SUFFIXES:
         raise UserError(f"{path}: a report is an HTML page", "give --out a name that ends in .html")
 
 

@@ -15,7 +15,7 @@ from neilfpp_method.train.run import rewrite_training
 
 __all__ = ["Pace", "with_steps"]
 
-EVERY = 0.02
+MIN_REVISION_SHARE = 0.02
 """Minimum time between two revisions of the plan, as a share of the budget."""
 SETTINGS = {
     Stage.SDF_INIT: "sdf_steps",
@@ -56,7 +56,7 @@ class Pace:
             The settings with the new steps; `config` itself if nothing has changed.
         """
         now = self.ledger.total
-        if now - self.revised_at < EVERY * self.plan.budget or position.step >= position.length:
+        if now - self.revised_at < MIN_REVISION_SHARE * self.plan.budget or position.step >= position.length:
             return config
         self.revised_at = now
         stage = position.stage.value

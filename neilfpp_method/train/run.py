@@ -67,7 +67,7 @@ BESIDE_NERFSTUDIO = "neilfpp"
 """Name of the run folder that the plugin writes next to nerfstudio's `config.yml`."""
 PIXELS = "pixels"
 """Folder within a run for the pixels of its training views."""
-DESCRIBING = ("capture.json", "scene.json", "environment.json")
+DESCRIBING_FILES = ("capture.json", "scene.json", "environment.json")
 """Files that are written before `config.json`; a folder is a run once it contains `config.json`."""
 HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
 """Temporary names of these files while `replacing` writes them."""
@@ -201,7 +201,7 @@ def check_free(path: Path) -> None:
 
 def _is_leftover(name: str) -> bool:
     """Whether a file is left over from a training that was killed before the run existed."""
-    return name in (PIXELS, LOCK, *DESCRIBING) or bool(HALF_WRITTEN.fullmatch(name))
+    return name in (PIXELS, LOCK, *DESCRIBING_FILES) or bool(HALF_WRITTEN.fullmatch(name))
 
 
 def create_run(path: Path, config: NeilfConfig, source: CaptureSource, facts: SceneFacts) -> None:

@@ -19,7 +19,7 @@ from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pixels
 from neilfpp_method.data.views import View
-from neilfpp_method.effects.evidence.material import JUDGED, seconds_of_evidence
+from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES, seconds_of_evidence
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.places.search import SEARCH_AT, SEARCH_SHARE, SETTLED_AT
 from neilfpp_method.effects.plan import Plan
@@ -69,7 +69,7 @@ not timed.
 """
 PICTURE_RAYS = 1024
 """Number of rays that are timed to estimate the time of a preview."""
-REPORT = 12.0
+PREVIEWS_PER_REPORT = 12.0
 """Time of the report as a multiple of that of a preview (estimate). A preview has an eighth of the pixels of
 the report's views; the rest is for the surface of the report.
 """
@@ -231,7 +231,7 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
         if with_material and stage is with_material[0]:
             cost = _with_first_light(cost, search, _fit_seconds(setup, times.fits[:1]))
         costs[stage.value] = cost
-    report = REPORT * times.picture if work.report else 0.0
+    report = PREVIEWS_PER_REPORT * times.picture if work.report else 0.0
     return Trial(Costs(costs, report), places * len(with_material), search.pixels)
 
 
@@ -289,7 +289,7 @@ def _some(capture: Capture) -> tuple[View, ...]:
 
 def _seconds_of_places(setup: _Setup) -> float:
     """Time of the measurements at places before a stage, in seconds; 0 if no effect needs them."""
-    needed = setup.model.lobe is not None and any(setup.plan.is_open(name) for name in JUDGED)
+    needed = setup.model.lobe is not None and any(setup.plan.is_open(name) for name in EFFECTS_AT_PLACES)
     return seconds_of_evidence(setup.pixels.device) if needed else 0.0
 
 

@@ -19,18 +19,20 @@ from neilfpp_method.schedule import Stage, StagePosition
 
 __all__ = ["restore_surface"]
 
-EVERY = 20
+STEPS_BETWEEN_CHECKS = 20
 """Number of steps between two checks."""
-UNTIL = 0.5
-"""Share of SDF init after which the surface is left alone."""
+LAST_CHECKED_SHARE = 0.5
+"""Share of SDF init up to which the surface is checked."""
 GRID = 32
 """Points along an edge of the checked grid over the scene sphere; it does not miss a ball of radius 0.05."""
-WIDTHS = 6.0
+MAX_DISTANCE_IN_WIDTHS = 6.0
 """Distance from the surface, in units of β, beyond which nothing is learned: the density is e⁻⁶ of that on
 the surface.
 """
-INSIDE = 0.1
-"""Share of the unit sphere that is inside afterwards. 0.05 and 0.1 gave the same quality."""
+RESTORED_SHARE = 0.1
+"""Share of the volume of the unit sphere that lies inside the restored surface. 0.05 and 0.1 gave the same
+quality.
+"""
 
 
 @torch.no_grad()
@@ -43,7 +45,11 @@ def restore_surface(host: Host, position: StagePosition) -> bool:
         host: the host, after an optimizer step.
         position: the stage, and the number of steps trained in it.
     """
-    is_due = position.stage is Stage.SDF_INIT and position.step % EVERY == 0 and position.share < UNTIL
+    is_due = (
+        position.stage is Stage.SDF_INIT
+        and position.step % STEPS_BETWEEN_CHECKS == 0
+        and position.share < LAST_CHECKED_SHARE
+    )
     if not is_due or not isinstance(host, VolSdfHost) or host.starts_from_shape:
         return False
     radius = host.config.volume.radius
@@ -51,9 +57,9 @@ def restore_surface(host: Host, position: StagePosition) -> bool:
     points = torch.cartesian_prod(axis, axis, axis)
     points = points[points.norm(dim=-1) < radius]
     distance = host.sdf_field(points).float()
-    if distance.min() <= WIDTHS * host.surface_width():
+    if distance.min() <= MAX_DISTANCE_IN_WIDTHS * host.surface_width():
         return False
-    host.sdf_field.lower_(float(distance[points.norm(dim=-1) < 1.0].quantile(INSIDE)))
+    host.sdf_field.lower_(float(distance[points.norm(dim=-1) < 1.0].quantile(RESTORED_SHARE)))
     if host.empty_space is not None:
         host.empty_space.age = None
     return True

@@ -23,7 +23,7 @@ BOUNCES, SAMPLES = 3, 16
 """Largest number of surface vertices of a path, and number of paths per direction: a compromise between noise
 and a response without noticeable delay.
 """
-BELOW = 44
+BELOW_GRAY = 44
 """Grey of directions below the surface, from which no light arrives."""
 
 
@@ -93,4 +93,4 @@ def light_picture(
     """Convert incident radiance to 8 bits with automatic exposure; directions below the surface are grey."""
     above = lat_long_directions(len(radiance)) @ normal > 0
     picture = display_color(radiance, auto_exposure(radiance[above]))
-    return np.where(above[..., None], picture, np.uint8(BELOW))
+    return np.where(above[..., None], picture, np.uint8(BELOW_GRAY))

@@ -33,7 +33,7 @@ PAPER = 0.93
 """Grey of the background, as a display value in [0, 1]."""
 LARGEST_ERROR = 0.5
 """Expected error from which a pixel has the brightest colour."""
-FAR = 100.0
+FAR_DEPTH = 100.0
 """Depth of pixels without a surface, scene units; the browser's own objects appear in front of it."""
 
 
@@ -198,9 +198,9 @@ def _image(
 
 
 def _depth(subject: Subject, camera: Camera) -> Float[np.ndarray, "H W"]:
-    """Depth along the camera's axis; `FAR` without a surface."""
+    """Depth along the camera's axis; `FAR_DEPTH` without a surface."""
     pixels = torch.arange(camera.width * camera.height, device=subject.device)
-    depth = torch.full((len(pixels),), FAR, device=subject.device)
+    depth = torch.full((len(pixels),), FAR_DEPTH, device=subject.device)
     if subject.surface is not None:
         rays = pixel_rays(camera, pixels).rays
         hits = subject.surface.intersect(rays.origins, rays.directions)

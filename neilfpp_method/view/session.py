@@ -36,11 +36,11 @@ __all__ = ["Session", "Shared"]
 MAP_SCALE = 3
 """Pixels of the page along an edge of each pixel of the map of incident light."""
 
-OWN = "the run's own"
+OWN_LIGHT = "the run's own"
 """Name of the run's light in the list of environments."""
-PHOTOGRAPH = 320
+PHOTOGRAPH_SIDE = 320
 """Longest side of the photograph of a view, pixels."""
-STOPS = 8.0
+MAX_STOPS = 8.0
 """Largest exposure in both directions, stops."""
 CAMERA, HELD_OUT, PICKED = (70, 110, 130), (200, 130, 60), (220, 60, 60)
 """Colours of training cameras, of held-out cameras, and of the selected point, sRGB bytes."""
@@ -131,7 +131,9 @@ class Session:
         self.layer = gui.add_dropdown(
             "Layer", titles, initial_value=previous.layer.value if keeps_layer else titles[0]
         )
-        self.exposure = gui.add_slider("Exposure", -STOPS, STOPS, 0.25, 0.0, hint="Stops, for PBR and R")
+        self.exposure = gui.add_slider(
+            "Exposure", -MAX_STOPS, MAX_STOPS, 0.25, 0.0, hint="Stops, for PBR and R"
+        )
         self.layer.on_update(lambda _: self._request())
         self.exposure.on_update(lambda _: self._request())
 
@@ -172,7 +174,7 @@ class Session:
 
     def _lights(self) -> dict[str, Lighting]:
         """The lights that can be selected, by name. A free light cannot be replaced."""
-        lights = {OWN: self.own}
+        lights = {OWN_LIGHT: self.own}
         if self.own.sky is not None:
             for name, sky in self.shared.skies.items():
                 lights[name] = Lighting(sky, self.own.lamps, own=False)
@@ -232,7 +234,7 @@ class Session:
         own, sky = self.own.sky, self.lights[self.environment.value].sky
         if own is not None and sky is not None:
             stops = math.log2(_brightness(own) / _brightness(sky))
-            self.exposure.value = float(np.clip(round(4 * stops) / 4, -STOPS, STOPS))
+            self.exposure.value = float(np.clip(round(4 * stops) / 4, -MAX_STOPS, MAX_STOPS))
         if sky is not own:
             self.lamps_on.value = False
         self._change_light()
@@ -347,7 +349,7 @@ def _forward(pose: Pose) -> Float[np.ndarray, " 3"]:
 
 
 def _photograph(view: View, hdr: bool) -> UInt8[np.ndarray, "H W 3"]:
-    view = scaled_view(view, min(1.0, PHOTOGRAPH / max(file_size(view))))
+    view = scaled_view(view, min(1.0, PHOTOGRAPH_SIDE / max(file_size(view))))
     pixels = read_colors(view, hdr)
     return display_color(pixels) if hdr else np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
 

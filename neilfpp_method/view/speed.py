@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 __all__ = ["RenderSpeed", "sizes"]
 
-FIRST_IMAGE = 0.12
+FIRST_IMAGE_SECONDS = 0.12
 """Seconds that the first image of a view may take, which gives about eight images per second while the camera
 moves.
 """
-BATCH = 0.05
+BATCH_SECONDS = 0.05
 """Seconds that a batch of rays should take. Between batches, an outdated image can be abandoned."""
 DEFAULT_SPEED = 20_000.0
 """Assumed rays per second before the first measurement."""
@@ -35,11 +35,11 @@ class RenderSpeed:
 
     def first_image(self, layer: str) -> int:
         """Number of rays of a first image."""
-        return max(MIN_RAYS, int(FIRST_IMAGE * self.by_layer.get(layer, DEFAULT_SPEED)))
+        return max(MIN_RAYS, int(FIRST_IMAGE_SECONDS * self.by_layer.get(layer, DEFAULT_SPEED)))
 
     def batch(self, layer: str) -> int:
         """Number of rays of a batch."""
-        return max(MIN_RAYS, int(BATCH * self.by_layer.get(layer, DEFAULT_SPEED)))
+        return max(MIN_RAYS, int(BATCH_SECONDS * self.by_layer.get(layer, DEFAULT_SPEED)))
 
 
 def sizes(width: int, height: int, at_once: int) -> list[float]:

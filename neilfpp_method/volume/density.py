@@ -10,7 +10,7 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["LaplaceDensity", "laplace_density", "laplace_depth"]
 
-CLOSE = 0.03
+SIMPSON_BELOW = 0.03
 """Difference of the signed distance over an interval, in units of β, below which Simpson's rule replaces the
 divided difference. The latter loses digits there; the former is exact to 1e-5, even across the kink of the
 density.
@@ -72,7 +72,7 @@ def laplace_depth(
     # absorb the second.
     rise = inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
     step = scaled.diff(dim=-1)
-    close = step.abs() < CLOSE
+    close = step.abs() < SIMPSON_BELOW
     # The divisor is 1 where the quotient is not used: an unused branch must not make the gradient NaN.
     quotient = rise / torch.where(close, torch.ones_like(step), step)
     one = torch.ones_like(beta)

@@ -29,11 +29,11 @@ RESOLUTION = 64
 """Vertices along an edge of the grid."""
 MARGIN = 1.1
 """Ratio of the bound on the slope to the largest slope between neighbouring vertices."""
-MISSED = 0.01
+MAX_OPACITY_IN_TRAINING = 0.01
 """Largest opacity of skipped space in training."""
-HARDLY_MISSED = 1e-3
+MAX_OPACITY_IN_EVALUATION = 1e-3
 """Largest opacity of skipped space in evaluation: a quarter of an 8-bit level."""
-OPAQUE = 8.0
+OPAQUE_DEPTH = 8.0
 """Optical depth behind which nothing is visible."""
 MIN_LIFE, MAX_LIFE = 20, 100
 """Training steps after which the grid may, and must, be sampled again."""
@@ -94,7 +94,7 @@ class EmptySpace(nn.Module):
         sampled again.
         """
         self._renew(sdf)
-        edges, clearance = self._edges(interval), self._clearance(beta, MISSED)
+        edges, clearance = self._edges(interval), self._clearance(beta, MAX_OPACITY_IN_TRAINING)
         parts = self._parts(rays, edges, clearance, beta)
         can_check = rays.origins.device.type == "cpu"
         if can_check and not self._is_confirmed(sdf, rays, edges, parts.empty, clearance):
@@ -115,11 +115,11 @@ class EmptySpace(nn.Module):
         """Which rays may show a surface, and the part of each ray that is visible, for a fixed field.
 
         The grid must belong to the current field, as the field itself is not checked; it is sampled at first
-        use. The parts that are left out have an opacity of at most `HARDLY_MISSED`.
+        use. The parts that are left out have an opacity of at most `MAX_OPACITY_IN_EVALUATION`.
         """
         self._renew(sdf)
         edges = self._edges(interval)
-        parts = self._parts(rays, edges, self._clearance(beta, HARDLY_MISSED), beta)
+        parts = self._parts(rays, edges, self._clearance(beta, MAX_OPACITY_IN_EVALUATION), beta)
         return _span(edges, parts.may_show, interval)
 
     @torch.no_grad()
@@ -140,7 +140,7 @@ class EmptySpace(nn.Module):
         self._renew(sdf)
         edges = self._edges(interval)
         distance = self._read(rays, edges)
-        empty = distance - self._max_error(edges) > self._clearance(beta, MISSED)
+        empty = distance - self._max_error(edges) > self._clearance(beta, MAX_OPACITY_IN_TRAINING)
         return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
 
     def _renew(self, sdf: SignedDistance) -> None:
@@ -163,7 +163,7 @@ class EmptySpace(nn.Module):
         width, distance, error = edges.diff(dim=-1), self._read(rays, edges), self._max_error(edges)
         # Inside, the density is at least 1 / (2 β).
         depth = ((distance + error < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
-        return _Parts(distance - error > clearance, depth - width / (2.0 * beta) > OPAQUE)
+        return _Parts(distance - error > clearance, depth - width / (2.0 * beta) > OPAQUE_DEPTH)
 
     def _edges(self, interval: Interval) -> Float[Tensor, "N E"]:
         """The ends of the equal parts of each ray."""

@@ -24,13 +24,13 @@ WIDTH = 0.75
 """Standard deviation of a point's weight, in cells: it reaches the closest vertices and little beyond. It
 shifts a surface of curvature κ by about WIDTH² κ / 2 cells squared.
 """
-BEHIND = 1.25
+MAX_DISTANCE_BEHIND = 1.25
 """Largest distance behind its plane at which a point has weight, in cells: less than thin objects have."""
-KNOWN = 0.15
-"""Smallest sum of weights of a vertex with a known distance; a point 1.5 cells away has a weight of 0.14."""
+MIN_WEIGHT = 0.15
+"""Smallest sum of weights at a vertex with a known distance; a point 1.5 cells away has a weight of 0.14."""
 HALF_DIAGONAL = 0.87
 """Half the diagonal of a cell, in cells: some vertex of a cell with a surface is at most this far from it."""
-AT_ONCE = 8192
+POINTS_AT_ONCE = 8192
 """Points per batch of the fusion; limits memory."""
 
 
@@ -66,17 +66,19 @@ def fuse_surface(
     inside = (position.abs() < radius - 2 * edge).all(-1)
     steps = torch.arange(-1, 3, device=position.device)
     around = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
-    for x, n, v in zip(*(t[inside].split(AT_ONCE) for t in (position, normal, value)), strict=True):
+    for x, n, v in zip(*(t[inside].split(POINTS_AT_ONCE) for t in (position, normal, value)), strict=True):
         vertex = ((x + radius) / edge).floor().long()[:, None] + around
         offset = vertex.to(x.dtype) * edge - radius - x[:, None]
         height = (offset * n[:, None]).sum(-1)
-        weight = (-0.5 * offset.square().sum(-1) / (WIDTH * edge) ** 2).exp() * (height > -BEHIND * edge)
+        weight = (-0.5 * offset.square().sum(-1) / (WIDTH * edge) ** 2).exp() * (
+            height > -MAX_DISTANCE_BEHIND * edge
+        )
         flat = ((vertex[..., 2] * resolution + vertex[..., 1]) * resolution + vertex[..., 0]).reshape(-1)
         columns = torch.stack((weight, weight * height, *(weight * c[:, None] for c in v.unbind(-1))))
         sums.index_add_(1, flat, columns.flatten(1))
     sums = sums.view(-1, resolution, resolution, resolution)
     weight, height = sums[0], sums[1] / sums[0].clamp_min(1e-6)
-    known = weight >= KNOWN
+    known = weight >= MIN_WEIGHT
     return FusedSurface(
         torch.where(known, height, _far(known & (height.abs() < HALF_DIAGONAL * edge), edge)),
         weight,

@@ -39,7 +39,7 @@ OPACITY_ERROR = 0.1
 BISECTIONS = 10
 """Number of bisection steps on β (published code)."""
 
-SPREAD = 1 / 3
+SPREAD_SHARE = 1 / 3
 """Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
 
 CUTS, ROUNDS = 128, 5
@@ -282,6 +282,6 @@ def opacity_samples(
     density = laplace_density(partition.sdf[:, :-1], beta)
     mass = render_weights(density, distances[:, :-1], distances[:, -1]).weights
     mass = mass / mass.sum(dim=-1, keepdim=True).clamp_min(torch.finfo(mass.dtype).tiny)
-    mass = (1.0 - SPREAD) * mass + SPREAD / mass.shape[-1]
+    mass = (1.0 - SPREAD_SHARE) * mass + SPREAD_SHARE / mass.shape[-1]
     within = inverse_cdf_samples(distances, mass, count - 2, stochastic)
     return torch.cat([distances[:, :1], within, distances[:, -1:]], dim=-1)

@@ -10,7 +10,7 @@ import pytest
 from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.files.images import write_png
 from neilfpp_method.data.focus import find_focus
-from neilfpp_method.data.scene_box import REACH, box_of_focus, box_of_points, find_box
+from neilfpp_method.data.scene_box import FOCUS_BOX_RADIUS, box_of_focus, box_of_points, find_box
 from neilfpp_method.data.views import View
 
 PLACE = np.array([1.0, -2.0, 0.5])
@@ -81,9 +81,9 @@ def test_a_distant_background_does_not_define_the_box(image):
     box = find_box(views, points)
     assert box.source == "focus"
     assert box.normalization.center == pytest.approx(tuple(PLACE), abs=1e-6)
-    assert box.normalization.scale == pytest.approx(REACH * 4.0)
+    assert box.normalization.scale == pytest.approx(FOCUS_BOX_RADIUS * 4.0)
     distances = [np.linalg.norm(box.normalization.camera(view.camera).c2w[:, 3]) for view in views]
-    assert min(distances) == pytest.approx(1 / REACH)
+    assert min(distances) == pytest.approx(1 / FOCUS_BOX_RADIUS)
 
 
 def test_points_that_end_before_the_cameras_define_the_box(image):

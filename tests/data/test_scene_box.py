@@ -13,7 +13,7 @@ import torch
 from neilfpp_method.data.cameras.projection import project
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.files.images import read_image, write_png
-from neilfpp_method.data.scene_box import REACH, box_of_cameras, box_of_points, find_box
+from neilfpp_method.data.scene_box import FOCUS_BOX_RADIUS, box_of_cameras, box_of_points, find_box
 from neilfpp_method.data.views import View
 from neilfpp_method.errors import UserError
 from tests.data.make_capture import CENTER, DISTANCE, RADIUS, camera_pose, make_capture
@@ -80,7 +80,7 @@ def test_a_box_beside_the_focus_of_the_cameras_is_not_used(tmp_path: Path) -> No
     plain, points = views(tmp_path), CENTER + 0.4 * (sphere_points() - CENTER)
     behind = points[:100] + np.array([2 * RADIUS, 0, 0])
     lopsided = np.concatenate([points, behind])
-    assert box_of_points(lopsided).scale < REACH * DISTANCE
+    assert box_of_points(lopsided).scale < FOCUS_BOX_RADIUS * DISTANCE
     box = find_box(plain, lopsided)
     assert box.source == "focus"
     assert np.allclose(box.normalization.center, CENTER, atol=0.1 * RADIUS)

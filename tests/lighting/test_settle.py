@@ -80,10 +80,10 @@ def test_candidates_around_a_lamp_become_one_lamp_at_its_position(base_color_kno
     """
     true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
     offsets = torch.tensor([[0.12, 0.0, 0.05], [-0.1, 0.15, 0.0], [0.0, -0.2, -0.15], [0.3, 0.3, 0.3]])
-    pieces = FoundLamps(
+    candidates = FoundLamps(
         LampPlaces(true.places.position + offsets, torch.zeros(4, 3)), 0.4 * true.intensity.expand(4, 3)
     )
-    found = settled(pieces, true, base_color_known)
+    found = settled(candidates, true, base_color_known)
     assert len(found.intensity) == 1
     torch.testing.assert_close(found.places.position, true.places.position, rtol=0, atol=0.01)
     torch.testing.assert_close(found.intensity.sum(), true.intensity.sum(), rtol=0.03, atol=0)

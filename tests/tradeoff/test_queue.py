@@ -47,7 +47,7 @@ class Engine:
 
 @pytest.fixture(autouse=True)
 def no_sleep(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(queue, "POLL", 0.0)
+    monkeypatch.setattr(queue, "POLL_SECONDS", 0.0)
 
 
 def test_a_place_has_one_run_at_a_time_and_takes_the_next():

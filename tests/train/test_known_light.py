@@ -13,6 +13,7 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.data.files.images import read_image
 from neilfpp_method.errors import UserError
+from neilfpp_method.lighting.decision import MIN_SAMPLES
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.settings.types import FreeLightConfig, LightFitConfig, MapLightConfig, NeilfConfig
@@ -146,6 +147,14 @@ def test_the_record_has_the_reason():
     )
     assert light_summary(auto, []) == "an environment map"
     assert light_summary(FreeLightConfig(), []) == "a field that is free at every point"
+
+
+def test_nothing_is_said_of_lamps_from_few_points():
+    auto, fit = MapLightConfig(kind="auto"), dataclasses.replace(FITS[1], points=MIN_SAMPLES - 1)
+    undecided = "an environment map; lamps were not decided on, with only 19 held-back points"
+    assert light_summary(auto, [FITS[0], fit]) == undecided
+    enough = dataclasses.replace(fit, points=MIN_SAMPLES)
+    assert light_summary(auto, [enough]).startswith("an environment map without lamps (error")
 
 
 @pytest.mark.parametrize(

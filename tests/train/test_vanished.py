@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from neilfpp_method.schedule import Stage, StagePosition
-from neilfpp_method.train.vanished import EVERY, INSIDE, restore_surface
+from neilfpp_method.train.vanished import RESTORED_SHARE, STEPS_BETWEEN_CHECKS, restore_surface
 from tests.hosts.balls import BallHost
 from tests.scenes import sphere_batch, sphere_model
 
-DUE = StagePosition(Stage.SDF_INIT, EVERY, 10 * EVERY)
+DUE = StagePosition(Stage.SDF_INIT, STEPS_BETWEEN_CHECKS, 10 * STEPS_BETWEEN_CHECKS)
 
 
 def test_a_vanished_surface_is_restored_once():
@@ -22,7 +22,7 @@ def test_a_vanished_surface_is_restored_once():
     assert float(host.render(batch.rays).opacity.detach().max()) > 0.9
     points = torch.randn(20_000, 3)
     points = points / points.norm(dim=-1, keepdim=True) * torch.rand(20_000, 1) ** (1 / 3)
-    assert float((host.sdf_field(points) < 0).float().mean()) == pytest.approx(INSIDE, abs=0.02)
+    assert float((host.sdf_field(points) < 0).float().mean()) == pytest.approx(RESTORED_SHARE, abs=0.02)
     assert not restore_surface(host, DUE)
 
 
@@ -40,9 +40,9 @@ def test_gradients_reach_geometry_again():
 @pytest.mark.parametrize(
     "position",
     [
-        StagePosition(Stage.SDF_INIT, EVERY + 1, 10 * EVERY),
-        StagePosition(Stage.SDF_INIT, 6 * EVERY, 10 * EVERY),
-        StagePosition(Stage.JOINT, EVERY, 10 * EVERY),
+        StagePosition(Stage.SDF_INIT, STEPS_BETWEEN_CHECKS + 1, 10 * STEPS_BETWEEN_CHECKS),
+        StagePosition(Stage.SDF_INIT, 6 * STEPS_BETWEEN_CHECKS, 10 * STEPS_BETWEEN_CHECKS),
+        StagePosition(Stage.JOINT, STEPS_BETWEEN_CHECKS, 10 * STEPS_BETWEEN_CHECKS),
     ],
     ids=["between checks", "second half", "joint"],
 )

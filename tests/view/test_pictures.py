@@ -16,7 +16,7 @@ from neilfpp_method.relight.lamplight import Lamplight
 from neilfpp_method.relight.sky import Sky
 from neilfpp_method.train.run import load_run
 from neilfpp_method.view.incident_map import light_at, light_picture, point_under
-from neilfpp_method.view.pictures import BOUNCES, FAR, PictureRequest, ViewerFrame, frames
+from neilfpp_method.view.pictures import BOUNCES, FAR_DEPTH, PictureRequest, ViewerFrame, frames
 from neilfpp_method.view.speed import RenderSpeed
 from neilfpp_method.view.subject import Lighting, own_light, scene_of, subject_of
 
@@ -86,7 +86,7 @@ def test_depth_is_along_the_axis(subject, camera):
     _, place, ray = cast(subject, camera)
     depth = (place @ camera.w2c[2, :3]) + camera.w2c[2, 3]
     assert np.percentile(np.abs(frame.depth.reshape(-1)[ray] - depth), 98) < 1e-3
-    assert frame.depth.max() == FAR
+    assert frame.depth.max() == FAR_DEPTH
 
 
 def test_pbr_converges_to_the_image_of_the_path_tracer(subject, camera):

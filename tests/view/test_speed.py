@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from neilfpp_method.view.speed import BATCH, FIRST_IMAGE, RenderSpeed, sizes
+from neilfpp_method.view.speed import BATCH_SECONDS, FIRST_IMAGE_SECONDS, RenderSpeed, sizes
 
 
 def test_sizes_double_up_to_the_whole_window():
@@ -22,10 +22,10 @@ def test_the_first_image_is_small_enough_to_appear_immediately():
 def test_the_number_of_rays_follows_the_measured_speed():
     speed = RenderSpeed()
     speed.note("normal", 100_000, 1.0)
-    assert speed.first_image("normal") == int(100_000 * FIRST_IMAGE)
+    assert speed.first_image("normal") == int(100_000 * FIRST_IMAGE_SECONDS)
     speed.note("normal", 300_000, 1.0)  # the mean of both: 200,000 per second
-    assert speed.first_image("normal") == int(200_000 * FIRST_IMAGE)
-    assert speed.batch("normal") == pytest.approx(200_000 * BATCH)
+    assert speed.first_image("normal") == int(200_000 * FIRST_IMAGE_SECONDS)
+    assert speed.batch("normal") == pytest.approx(200_000 * BATCH_SECONDS)
     speed.note("radiance", 1, 1.0)  # separately for each layer, and never 0
     assert speed.first_image("radiance") == 256
-    assert speed.first_image("normal") == int(200_000 * FIRST_IMAGE)
+    assert speed.first_image("normal") == int(200_000 * FIRST_IMAGE_SECONDS)

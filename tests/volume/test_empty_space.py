@@ -70,7 +70,7 @@ def assert_nothing_lost(sdf, rays, beta):
     assert (part.near >= whole.near).all()
     assert (part.far <= whole.far).all()
     assert (part.far >= part.near).all()
-    allowed = empty_space.MISSED + math.exp(-empty_space.OPAQUE)
+    allowed = empty_space.MAX_OPACITY_IN_TRAINING + math.exp(-empty_space.OPAQUE_DEPTH)
     place, weight = true_weights(sdf, rays, beta, whole)
     outside = (place < part.near[:, None]) | (place > part.far[:, None])
     assert (weight * outside).sum(-1).max() < allowed

@@ -18,7 +18,7 @@ from neilfpp_method.volume.density import laplace_density
 from neilfpp_method.volume.intersect import Interval
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
-    SPREAD,
+    SPREAD_SHARE,
     SampleCounts,
     cut,
     error_bounded_samples,
@@ -218,7 +218,7 @@ def test_samples_follow_the_true_opacity():
     opacity = -np.expm1(-(depth - 0.5 * math.exp(-1 / beta)))
     share = (np.arange(510) + 0.5) / 510
     # The third that is spread follows the cuts, which are nearly uniform here, in addition to both ends.
-    spread = (t[1:-1] / 4.0 - opacity[1:-1]) * SPREAD
+    spread = (t[1:-1] / 4.0 - opacity[1:-1]) * SPREAD_SHARE
     assert np.abs(share - opacity[1:-1] - spread).max() <= found.error_bound.item()
     assert t[0] == 0.0
     assert t[-1] == 4.0

@@ -24,7 +24,7 @@ SIDES = (128, 256, 512, 1024)
 """Longer sides of the reduced images that are registered, in pixels, from coarse to fine."""
 ROUNDS = 20
 """Largest number of Gauss–Newton steps per size."""
-CONVERGED = 0.01
+CONVERGED_MOTION = 0.01
 """Motion of a Gauss–Newton step, in pixels of the reduced image, below which the iteration ends."""
 MIN_SHIFT = 0.25
 """Smallest corner motion, in pixels, for which an image is resampled; resampling blurs."""
@@ -177,7 +177,7 @@ def _refined(pair: _Pair, motion: Float64[np.ndarray, "3 3"]) -> Float64[np.ndar
         change = centered @ np.linalg.inv(small) @ np.linalg.inv(centered)
         motion = motion @ change
         motion = motion / motion[2, 2]
-        if _corner_shift(change, (height, width)) < CONVERGED:
+        if _corner_shift(change, (height, width)) < CONVERGED_MOTION:
             break
     return motion
 

@@ -39,7 +39,7 @@ GROUPS = "brackets.json"
 NUMBERED = re.compile(r"[_-]\d+$")
 """Number at the end of a name, NAME_0 or NAME-0."""
 
-CALIBRATED = 6
+MAX_CALIBRATION_BRACKETS = 6
 """Largest number of brackets from which a response is calibrated."""
 CALIBRATION_SIDE = 1024
 """Longest side of the images for the calibration of a response, in pixels; bounds the memory."""
@@ -195,7 +195,7 @@ def _response(brackets: Brackets, response: Literal["auto", "linear", "srgb"]) -
         )
     alike = Counter(tuple(bracket.values()) for bracket in brackets.values()).most_common(1)[0][0]
     usable = [bracket for bracket in brackets.values() if tuple(bracket.values()) == alike]
-    step = -(-len(usable) // CALIBRATED)
+    step = -(-len(usable) // MAX_CALIBRATION_BRACKETS)
     return calibrate([_thin(_read(bracket, 1.0).bracket) for bracket in usable[::step]])
 
 

@@ -29,7 +29,7 @@ SAMPLES_SIDE = 16
 """Side of the square of sampled pixels from which the response is calibrated."""
 SMOOTHNESS = 30.0
 """Weight of the smoothness of the response; OpenCV's default of 10 overfits errors of hand-held brackets."""
-NOISE = 3
+NOISE_LEVELS = 3
 """Largest amount, in 8-bit levels, by which noise may make a longer exposure darker than a shorter one."""
 
 
@@ -77,7 +77,7 @@ def calibrate(brackets: Sequence[Bracket]) -> Response:
     ]
     levels = np.concatenate(stacks, axis=1).astype(np.uint8)
     more = np.diff(levels[np.argsort(brackets[0].exposures)].astype(np.int16), axis=0)
-    lighter = (more >= -NOISE).all(axis=(0, 2))
+    lighter = (more >= -NOISE_LEVELS).all(axis=(0, 2))
     if lighter.mean() > 0.5:
         levels = levels[:, lighter]
     total = levels.sum(axis=(0, 2), dtype=np.int64)

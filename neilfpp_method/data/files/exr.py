@@ -24,7 +24,7 @@ __all__ = ["ExrHeader", "Window", "exr_header", "exr_samples"]
 COLORS, ALPHA = ("R", "G", "B"), "A"
 VECTOR = ("X", "Y", "Z")
 SINGLE = (("Y",), ("Z",))
-MAIN = ("combined", "rgba", "rgb", "beauty")
+MAIN_IMAGE_NAMES = ("combined", "rgba", "rgb", "beauty")
 """Names of the part or the layer that is the image in Blender, Nuke and other renderers, in small letters;
 others may stand before it, as in "ViewLayer.Combined"."""
 CHROMA = "RY"
@@ -132,7 +132,7 @@ def _picture(
 
 def _is_main(name: str) -> bool:
     """Whether the name of a part or a layer says that it is the image and not one of its components."""
-    return name.rpartition(".")[2].lower() in MAIN
+    return name.rpartition(".")[2].lower() in MAIN_IMAGE_NAMES
 
 
 def _layers(names: Sequence[str] | Mapping[str, object]) -> list[str]:

@@ -15,7 +15,7 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["Entry", "write_json"]
 
-CAMERAS = "export the cameras again"
+CAMERAS_REMEDY = "export the cameras again"
 """Remedy for a damaged file of cameras, which most of these files are."""
 
 
@@ -28,13 +28,13 @@ class Entry:
         remedy: how to repair the file.
     """
 
-    def __init__(self, value: Any, where: str, remedy: str = CAMERAS) -> None:
+    def __init__(self, value: Any, where: str, remedy: str = CAMERAS_REMEDY) -> None:
         self.value = value
         self.where = where
         self.remedy = remedy
 
     @staticmethod
-    def load(path: Path, remedy: str = CAMERAS) -> Entry:
+    def load(path: Path, remedy: str = CAMERAS_REMEDY) -> Entry:
         """Read a file and return its root value; the remedy also applies to all entries of the file."""
         try:
             # Programs on Windows write a byte order mark at the beginning.

@@ -15,9 +15,9 @@ __all__ = ["tiff_header", "tiff_samples"]
 
 COLORS = ("MINISBLACK", "MINISWHITE", "RGB", "PALETTE", "SEPARATED", "YCBCR")
 """Meanings of the colours of a TIFF file that are read."""
-STORED = ("MINISBLACK", "RGB")
+STORED_COLORS = ("MINISBLACK", "RGB")
 """Meanings of the colours with which stored values are brightness or RGB."""
-UNPACKED = ("NONE", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS")
+DECODED_COMPRESSIONS = ("NONE", "ADOBE_DEFLATE", "DEFLATE", "PACKBITS")
 """Compressions that tifffile decodes without further packages; OpenCV decodes the others."""
 PREDICTORS = (tifffile.PREDICTOR.NONE, tifffile.PREDICTOR.HORIZONTAL)
 """Predictors that tifffile undoes without further packages."""
@@ -44,8 +44,8 @@ def tiff_samples(path: Path) -> Shaped[np.ndarray, "H W C"]:
         page = _page(file)
         if page.photometric.name not in COLORS:
             raise ValueError(f"its colours are {page.photometric.name}, not RGB")
-        is_plain = page.compression.name in UNPACKED and page.predictor in PREDICTORS
-        if is_plain and page.photometric.name in STORED and page.bitspersample in FULL_BITS:
+        is_plain = page.compression.name in DECODED_COMPRESSIONS and page.predictor in PREDICTORS
+        if is_plain and page.photometric.name in STORED_COLORS and page.bitspersample in FULL_BITS:
             # OpenCV multiplies 8-bit colours by an alpha that is not associated, refuses rotated images and
             # further channels, does not support half precision, and reads separate planes as pixels.
             samples = page.asarray()

@@ -34,7 +34,7 @@ __all__ = ["LAYOUT", "read", "recognize"]
 LAYOUT = "inputs/sfm_scene.json"
 PLACES = ("inputs/sfm_scene.json", "sfm_scene.json", "inputs/model/sfm_scene.json")
 POINT_CLOUD = "model/oriented_pcd.ply"
-VALID = 2
+VALID_FLAG = 2
 """Value of `flg` of a camera with a valid pose."""
 
 
@@ -59,7 +59,7 @@ def read(root: Path) -> CaptureFiles:
                 f"{files.name(key)}: an image without a camera", "add its camera, or remove the entry"
             )
     valid = sorted(
-        (key for key in tracks.entries() if tracks[key]["flg"].value == VALID), key=_number_of(tracks)
+        (key for key in tracks.entries() if tracks[key]["flg"].value == VALID_FLAG), key=_number_of(tracks)
     )
     for key in valid:
         if key not in files.entries():
@@ -67,7 +67,9 @@ def read(root: Path) -> CaptureFiles:
                 f"{tracks.name(key)}: a camera without an image", f"add its image to {files.where}"
             )
     if not valid:
-        raise UserError(f"{path}: no images with a valid camera", f"give at least one entry the flg {VALID}")
+        raise UserError(
+            f"{path}: no images with a valid camera", f"give at least one entry the flg {VALID_FLAG}"
+        )
     listed = {key: files[key].text() for key in files.entries()}
     inputs = _inputs_folder(root, path, listed[valid[0]])
     views = tuple(_view(root, inputs, int(key), tracks[key], files[key]) for key in valid)

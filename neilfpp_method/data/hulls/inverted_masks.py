@@ -26,13 +26,13 @@ from neilfpp_method.errors import UserError
 
 __all__ = ["look_inverted"]
 
-MOST = 0.5
+MIN_BORDER_SHARE = 0.5
 """Smallest median share of the border pixels that inverted masks cover."""
-UNCOVERED = 0.9
+MIN_UNCOVERED_SHARE = 0.9
 """Smallest share of the views in which inverted masks do not cover the point that the cameras look at."""
-WHOLE = 0.98
+WHOLE_BORDER_SHARE = 0.98
 """Smallest share of the border pixels that counts as the whole border."""
-MIN_HOLE = 1e-3
+MIN_HOLE_SHARE = 1e-3
 """Smallest share of the image that is a hole; smaller ones are errors of a mask."""
 
 
@@ -43,7 +43,7 @@ def look_inverted(outlines: Sequence[Outline]) -> bool:
         outlines: at least one mask, with cameras in the world frame.
     """
     borders = [_border_share(outline) for outline in outlines]
-    if float(np.median(borders)) < MOST:
+    if float(np.median(borders)) < MIN_BORDER_SHARE:
         return False
     return _spare_the_focus(outlines) or _have_a_common_hole(outlines, borders)
 
@@ -58,14 +58,14 @@ def _spare_the_focus(outlines: Sequence[Outline]) -> bool:
     if focus is None:
         return False
     counts = sightings(outlines, focus.center[None])
-    return bool(counts.inside[0] <= (1 - UNCOVERED) * counts.visible_in[0])
+    return bool(counts.inside[0] <= (1 - MIN_UNCOVERED_SHARE) * counts.visible_in[0])
 
 
 def _have_a_common_hole(outlines: Sequence[Outline], borders: Sequence[float]) -> bool:
     holes = [
         replace(outline, inside=~outline.inside)
         for outline, border in zip(outlines, borders, strict=True)
-        if border >= WHOLE and 1 - outline.inside.mean() >= MIN_HOLE
+        if border >= WHOLE_BORDER_SHARE and 1 - outline.inside.mean() >= MIN_HOLE_SHARE
     ]
     if len(holes) <= len(outlines) / 2:
         return False

@@ -32,7 +32,7 @@ extends beyond the image show a mixture of object and background.
 """
 MAX_RAYS = 1000
 """Largest number of rays that are tested."""
-PLACES = 65
+POINTS_PER_RAY = 65
 """Number of test points on each ray, evenly spaced inside the sphere around the scene box."""
 RADIUS = math.sqrt(3.0)
 """Radius of that sphere, scene units: it passes through the corners of the box."""
@@ -111,7 +111,7 @@ def _leaves_room(outlines: Sequence[Outline], rays: RayBatch, normalization: Nor
         rays: rays through such pixels, in the scene frame.
         normalization: the transformation between the two frames.
     """
-    held = agreement(outlines, _places(rays, normalization)).reshape(len(rays), PLACES)
+    held = agreement(outlines, _places(rays, normalization)).reshape(len(rays), POINTS_PER_RAY)
     return bool((held >= AGREEMENT).any(axis=1).mean() >= MIN_INSIDE_SHARE)
 
 
@@ -121,6 +121,6 @@ def _places(rays: RayBatch, normalization: Normalization) -> Float64[np.ndarray,
     nearest = -(origins * directions).sum(-1, keepdim=True)
     missed = origins.square().sum(-1, keepdim=True) - nearest.square()
     half = (RADIUS**2 - missed).clamp_min(0.0).sqrt()
-    along = nearest + half * torch.linspace(-1.0, 1.0, PLACES, dtype=half.dtype)
+    along = nearest + half * torch.linspace(-1.0, 1.0, POINTS_PER_RAY, dtype=half.dtype)
     points = origins[:, None] + along[..., None] * directions[:, None]
     return normalization.to_world(points.reshape(-1, 3)).numpy()

@@ -50,9 +50,9 @@ RESOLUTION = 512
 """Number of grid points along an edge of the scene when a surface is extracted from a distance field."""
 SPACING = 0.2
 """Distance between surface samples, mm (official code)."""
-CAP = 20.0
+MAX_DISTANCE = 20.0
 """Distance from which points are left out of the mean, mm (official code)."""
-PATCH = 60.0
+BOX_MARGIN = 60.0
 """Margin around the box of the observed cells, mm (official code)."""
 SEED = 0
 """Seed of the order in which points are removed."""
@@ -98,7 +98,7 @@ def chamfer_of_scan(
         UserError: no point of the estimate lies in an observed cell, or none within 20 mm of the truth.
     """
     points = thinned(surface_samples(vertices, faces, SPACING), SPACING, SEED)
-    inside = ((points >= scan.low - PATCH) & (points < scan.high + 2 * PATCH)).all(-1)
+    inside = ((points >= scan.low - BOX_MARGIN) & (points < scan.high + 2 * BOX_MARGIN)).all(-1)
     points = points[inside]
     cells = np.around((points - scan.low) / scan.cell).astype(np.int64)
     on_grid = ((cells >= 0) & (cells < scan.mask.shape)).all(-1)
@@ -109,11 +109,11 @@ def chamfer_of_scan(
             f"the protocol {NAME}: no point of the surface lies in the region that the scanner observed",
             "give the capture in the frame of the dataset, millimetres",
         )
-    accuracy = capped_mean(observed, scan.points, CAP)
-    completeness = capped_mean(above, points, CAP)
+    accuracy = capped_mean(observed, scan.points, MAX_DISTANCE)
+    completeness = capped_mean(above, points, MAX_DISTANCE)
     if accuracy is None or completeness is None:
         raise UserError(
-            f"the protocol {NAME}: no point of the surface lies within {CAP:g} mm of the truth",
+            f"the protocol {NAME}: no point of the surface lies within {MAX_DISTANCE:g} mm of the truth",
             "give the capture in the frame of the dataset, millimetres",
         )
     return {

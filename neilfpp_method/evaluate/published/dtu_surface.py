@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 __all__ = ["capped_mean", "surface_samples", "thinned"]
 
-AT_ONCE = 50_000
+POINTS_AT_ONCE = 50_000
 """Number of points per neighbour query, which bounds the memory."""
 
 
@@ -53,8 +53,8 @@ def thinned(points: Float[np.ndarray, "P 3"], spacing: float, seed: int) -> Floa
     shuffled = points[order]
     tree = cKDTree(shuffled)
     kept: Bool[np.ndarray, " P"] = np.ones(len(points), bool)
-    for begin in range(0, len(points), AT_ONCE):
-        neighbors = tree.query_ball_point(shuffled[begin : begin + AT_ONCE], spacing)
+    for begin in range(0, len(points), POINTS_AT_ONCE):
+        neighbors = tree.query_ball_point(shuffled[begin : begin + POINTS_AT_ONCE], spacing)
         for i, near in enumerate(neighbors, begin):
             if kept[i]:
                 kept[near] = False

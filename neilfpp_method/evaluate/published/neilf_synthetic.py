@@ -33,7 +33,7 @@ from neilfpp_method.train.run import Run, check_material
 __all__ = ["NEILF_SYNTHETIC", "aces", "frame_psnr", "median_gamma"]
 
 NAME = "neilf-synthetic"
-BEHIND = 0.05
+MAX_TRANSMITTANCE = 0.05
 """Transmittance above which a pixel is outside of the mask (`code/model/geo_volsdf.py`)."""
 
 
@@ -80,7 +80,7 @@ def _check(run: Run) -> None:
 
 def _measure(run: Run, rendered: Sequence[RenderedView]) -> dict[str, float]:
     known = known_test_views(run, rendered).views
-    masks = [view.maps["opacity"][..., 0] > 1 - BEHIND for view in rendered]
+    masks = [view.maps["opacity"][..., 0] > 1 - MAX_TRANSMITTANCE for view in rendered]
     if not any(mask.any() for mask in masks):
         raise no_surface(run)
     pairs = list(zip(rendered, known, masks, strict=True))
