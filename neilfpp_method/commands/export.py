@@ -31,10 +31,16 @@ class Export:
     """Number of light probes on the surface; default: 16 for the free light field, otherwise 0."""
     texture_size: int = 2048
     """Width and height of the asset's textures, in texels."""
-    faces: int = 30_000
-    """Maximum number of triangles of the asset."""
-    error: float = 0.001
-    """Maximum error of the simplified surface, in scene units; a normal map represents finer relief."""
+    faces: int | None = None
+    """Maximum number of triangles of the asset; default: 30000. Given without --error, it is always kept.
+    Otherwise the error is kept first, and the command reports if that takes more triangles."""
+    error: float | None = None
+    """Maximum distance of the simplified surface and the full one from one another, for 99.9 % of both, in
+    scene units (the object lies in a ball of radius 1); default: 0.001. A normal map represents finer
+    relief."""
+    holes: float = 0.05
+    """Maximum width of holes in the asset's surface that are closed, in scene units; 0 closes none. Holes
+    are parts that no camera saw."""
     confidence: bool = False
     """Add a texture of the expected error of base colour, roughness and metallic; takes twice as long."""
     checkpoint: Checkpoint = "last"
@@ -54,7 +60,9 @@ def run(options: Export) -> None:
         out=options.out,
         what=options.what,
         probes=options.probes,
-        asset=AssetOptions(options.resolution, options.texture_size, options.faces, options.error),
+        asset=AssetOptions(
+            options.resolution, options.texture_size, options.faces, options.error, options.holes
+        ),
         deviations=deviations_at if options.confidence else None,
         checkpoint=options.checkpoint,
         device=options.device,

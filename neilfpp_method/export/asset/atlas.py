@@ -75,7 +75,7 @@ def unwrap(surface: AssetSurface, size: int) -> Unwrapped:
     if atlas.atlas_count != 1 or gap < MIN_GAP:
         raise UserError(
             f"{atlas.chart_count} charts of {len(faces)} triangles do not fit on a texture of {size}×{size}",
-            "raise --texture-size, or lower --faces",
+            "raise --texture-size, or raise --error",
         )
     return Unwrapped(
         vertices[source],

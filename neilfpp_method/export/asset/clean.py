@@ -12,13 +12,20 @@ from neilfpp_method.export.asset.surface import AssetSurface, creased
 __all__ = ["HOLE", "clean", "close_holes", "keep_visible", "remove_small_components"]
 
 HOLE = 0.05
-"""Largest extent, scene units, of holes that are closed, and of invisible patches that are kept."""
+"""Default of the largest extent, scene units, of holes that are closed, and of invisible patches that are
+kept.
+"""
 MIN_COMPONENT = 0.002
 """A component whose area is a smaller fraction of that of the largest component is removed."""
 
 
-def clean(surface: AssetSurface, visible: Bool[np.ndarray, " F"]) -> AssetSurface:
+def clean(surface: AssetSurface, visible: Bool[np.ndarray, " F"], hole: float = HOLE) -> AssetSurface:
     """Keep the visible part of a surface, remove small components, and close small holes.
+
+    Args:
+        surface: the surface.
+        visible: triangles that cameras see.
+        hole: largest extent, scene units, of holes that are closed, and of invisible patches that are kept.
 
     Raises:
         UserError: no triangle is visible.
@@ -27,11 +34,11 @@ def clean(surface: AssetSurface, visible: Bool[np.ndarray, " F"]) -> AssetSurfac
         raise UserError(
             "no training camera sees the surface", "train the run for longer, and check its previews"
         )
-    return close_holes(remove_small_components(keep_visible(surface, visible)))
+    return close_holes(remove_small_components(keep_visible(surface, visible, hole)), hole)
 
 
-def keep_visible(surface: AssetSurface, visible: Bool[np.ndarray, " F"]) -> AssetSurface:
-    """Keep visible triangles, the triangles that touch them, and invisible patches of at most `HOLE`."""
+def keep_visible(surface: AssetSurface, visible: Bool[np.ndarray, " F"], hole: float = HOLE) -> AssetSurface:
+    """Keep visible triangles, the triangles that touch them, and invisible patches of at most `hole`."""
     on_visible = np.zeros(len(surface.vertices), dtype=bool)
     on_visible[surface.faces[visible]] = True
     kept = on_visible[surface.faces].any(axis=1)
@@ -39,7 +46,7 @@ def keep_visible(surface: AssetSurface, visible: Bool[np.ndarray, " F"]) -> Asse
     component = _components(surface.part(invisible))
     for number in np.unique(component):
         patch = invisible[component == number]
-        if _width(surface, surface.faces[patch]) <= HOLE:
+        if _width(surface, surface.faces[patch]) <= hole:
             kept[patch] = True
     return surface.part(kept)
 
@@ -51,12 +58,12 @@ def remove_small_components(surface: AssetSurface) -> AssetSurface:
     return surface.part((area >= MIN_COMPONENT * area.max())[component])
 
 
-def close_holes(surface: AssetSurface) -> AssetSurface:
-    """Close each border of at most `HOLE` by a fan of triangles around its centre, oriented consistently."""
+def close_holes(surface: AssetSurface, hole: float = HOLE) -> AssetSurface:
+    """Close each border of at most `hole` by a fan of triangles around its centre, oriented consistently."""
     vertices, fans = [surface.vertices], []
     count = len(surface.vertices)
     for loop in _borders(surface):
-        if np.ptp(surface.vertices[loop], axis=0).max() > HOLE:
+        if np.ptp(surface.vertices[loop], axis=0).max() > hole:
             continue
         # A border has the orientation of its triangles, so the fan must have the opposite one.
         fans.append(np.stack([np.roll(loop, -1), loop, np.full(len(loop), count)], axis=1))

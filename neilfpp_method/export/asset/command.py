@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,9 +16,9 @@ from torch import Tensor
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.atlas import Unwrapped, unwrap
 from neilfpp_method.export.asset.bake import Detail, bake
-from neilfpp_method.export.asset.clean import clean
+from neilfpp_method.export.asset.clean import HOLE, clean
 from neilfpp_method.export.asset.files import write_asset
-from neilfpp_method.export.asset.simplify import MIN_FACES, simplified
+from neilfpp_method.export.asset.simplify import MAX_FACES, MIN_FACES, Simplified, simplified
 from neilfpp_method.export.asset.surface import fine_surface
 from neilfpp_method.export.asset.usd import has_usd
 from neilfpp_method.export.asset.visible import visible_faces
@@ -30,12 +30,12 @@ __all__ = ["AssetOptions", "Bar", "Deviations", "check_asset", "export_asset"]
 
 MIN_TEXTURE, MAX_TEXTURE = 64, 8192
 """Smallest and largest width of the textures, texels."""
-MAX_FACES = 200_000
-"""Largest number of triangles; with more, xatlas takes minutes."""
+FACES, ERROR = 30_000, 0.001
+"""Default number of triangles, and default error, scene units."""
 REACH_FACTOR = 2.0
-"""The fine surface is searched within this multiple of the distance below which 99 % of its points are."""
-MIN_REACH = 1e-3
-"""Least distance within which the fine surface is searched, scene units."""
+"""The fine surface is searched within this multiple of the distance below which 99.9 % of its points are."""
+MIN_REACH, MAX_REACH = 1e-3, 0.1
+"""Bounds of the distance within which the fine surface is searched, scene units."""
 
 Bar = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 """Opens a progress bar with a title; the function it yields takes the fraction that is done."""
@@ -50,14 +50,17 @@ class AssetOptions:
     Attributes:
         resolution: resolution of the fine surface (`extracted_surface`).
         texture_size: width and height of the textures, texels.
-        faces: largest number of triangles.
-        error: largest distance, scene units, that simplification below `faces` may cause.
+        faces: largest number of triangles; None for `FACES`. A given error is kept first.
+        error: largest distance, scene units, between the surface and the simplified one; None for `ERROR`,
+            which may be exceeded if `faces` is given.
+        hole: largest extent, scene units, of holes that are closed.
     """
 
     resolution: int
     texture_size: int
-    faces: int
-    error: float
+    faces: int | None = None
+    error: float | None = None
+    hole: float = HOLE
 
 
 def check_asset(run: Run, options: AssetOptions) -> None:
@@ -76,13 +79,14 @@ def check_asset(run: Run, options: AssetOptions) -> None:
             f"a texture cannot have {options.texture_size} texels per side",
             f"give {MIN_TEXTURE} to {MAX_TEXTURE} with --texture-size",
         )
-    if not MIN_FACES <= options.faces <= MAX_FACES:
+    if options.faces is not None and not MIN_FACES <= options.faces <= MAX_FACES:
         raise UserError(
             f"an asset cannot have {options.faces} triangles",
             f"give {MIN_FACES} to {MAX_FACES} with --faces",
         )
-    if not options.error >= 0:
-        raise UserError(f"--error cannot be {options.error:g}", "give a length in scene units, 0 or larger")
+    for name, length in (("--error", options.error), ("--holes", options.hole)):
+        if length is not None and not length >= 0:
+            raise UserError(f"{name} cannot be {length:g}", "give a length in scene units, 0 or larger")
 
 
 @torch.no_grad()
@@ -110,17 +114,17 @@ def export_asset(
     """
     full = fine_surface(run, options.resolution, partial(console.print, soft_wrap=True))
     cameras = [run.capture.scene_camera(view) for view in run.capture.train_views]
-    fine = clean(full, visible_faces(full, cameras))
+    fine = clean(full, visible_faces(full, cameras), options.hole)
     console.print(f"surface: kept {len(fine.faces)} of {len(full.faces)} triangles, which cameras see")
-    coarse = simplified(fine, options.faces, options.error)
-    distance = coarse.distance
-    near = f"99 % of the surface within {distance.near:.2g} scene units"
-    missed = f", {100 * distance.missed:.1f} % missing" if distance.missed > 0 else ""
-    console.print(f"simplified: {len(coarse.surface.faces)} triangles, {near}{missed}")
+    faces_first = options.faces is not None and options.error is None
+    faces, error = options.faces or FACES, ERROR if options.error is None else options.error
+    coarse = simplified(fine, faces, error, faces_first)
+    for line in _about(coarse, faces, error, faces_first):
+        console.print(line, soft_wrap=True)
     mesh = unwrap(coarse.surface, options.texture_size)
     expected = None if deviations is None else deviations(run, _points(run, mesh)).double().cpu().numpy()
     with bar("textures") as advance:
-        detail = Detail(fine, reach=max(REACH_FACTOR * distance.near, MIN_REACH))
+        detail = Detail(fine, reach=min(max(REACH_FACTOR * coarse.distance.near, MIN_REACH), MAX_REACH))
         textures = bake(run, mesh, detail, options.texture_size, expected, advance)
     console.print(
         f"textures: {mesh.charts} charts on {100 * textures.covered:.0f} % of {options.texture_size}² texels"
@@ -131,6 +135,18 @@ def export_asset(
         remedy = "pip install 'neilfpp-method[usd]'"
         console.print(f"no USD file was written, because usd-core is missing: {remedy}", soft_wrap=True)
     console.print(f"written to {out}", soft_wrap=True)
+
+
+def _about(coarse: Simplified, faces: int, error: float, faces_first: bool) -> Iterator[str]:
+    """What the user reads about a simplified surface."""
+    count, distance = len(coarse.surface.faces), coarse.distance
+    near = f"99.9 % within {distance.near:.2g} scene units, all within {distance.largest:.2g}"
+    yield f"simplified: {count} triangles, {near} of the surface"
+    if count > faces:
+        fewer = f"{faces} would be {coarse.wished.near:.2g} off"
+        yield f"more than {faces} triangles, to keep the error {error:g} ({fewer}); for fewer, raise --error"
+    if distance.near > error and not faces_first:
+        yield f"the error is larger than {error:g}, because an asset has at most {MAX_FACES} triangles"
 
 
 def _points(run: Run, mesh: Unwrapped) -> OrientedPoints:

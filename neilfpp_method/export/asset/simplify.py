@@ -2,90 +2,162 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import fast_simplification
 import numpy as np
 import trimesh
+from jaxtyping import Float
+from scipy.spatial import cKDTree
 
 from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, hits_along_normals
 
-__all__ = ["Distance", "Simplified", "distance_between", "simplified"]
+__all__ = ["MAX_FACES", "MIN_FACES", "Distance", "Simplified", "distance_between", "simplified"]
 
 SAMPLES = 20_000
-"""Number of points of the fine surface at which the distance is measured."""
-PERCENTILE = 99.0
-"""Percentile of the distances that is reported."""
-MAX_MISSED = 0.02
-"""Largest accepted fraction of points without a coarse surface nearby. Such points occur at borders, and at
-planes that the decimation folds.
-"""
+"""Number of points of each surface at which the distance to the other is measured."""
+PERCENTILE = 99.9
+"""Percentile of the distances that the error bounds. The largest one depends on where the points are."""
 MIN_FACES = 100
 """Least number of triangles; fewer would save nothing."""
+MAX_FACES = 200_000
+"""Largest number of triangles; with more, xatlas takes minutes."""
 REACH = 0.1
-"""Largest distance at which the coarse surface is searched, scene units."""
+"""Largest distance at which the other surface is searched along a normal, scene units."""
+NEIGHBORS = 16
+"""Number of triangles around a point among which a first bound of its distance is searched."""
+WAYS = ((3.0, True), (4.0, True), (5.0, True), (7.0, False))
+"""Aggressiveness of the decimation, and whether borders are kept; the first that reaches the number of
+triangles is used. From about 7 on, triangles of planes fold, and without borders whole strips are lost.
+"""
 
 
 @dataclass(frozen=True)
 class Distance:
-    """Distance from a fine surface to a coarse one.
+    """Distance between two surfaces: of points of either one to the part of the other that faces the same
+    way.
 
     Attributes:
-        near: 99th percentile of the distances, scene units.
-        missed: fraction of points without a coarse surface within `REACH`.
+        near: 99.9th percentile, scene units; the larger one of both directions.
+        largest: largest distance, scene units; infinite if a point has no such part.
     """
 
     near: float
-    missed: float
+    largest: float
 
 
 @dataclass(frozen=True)
 class Simplified:
-    """A coarse surface, and the distance from the fine surface to it."""
+    """A coarse surface.
+
+    Attributes:
+        surface: the surface.
+        distance: its distance from the fine surface.
+        wished: the distance at the wished number of triangles.
+    """
 
     surface: AssetSurface
     distance: Distance
+    wished: Distance
 
 
-def simplified(fine: AssetSurface, max_faces: int, error: float) -> Simplified:
-    """Reduce the number of triangles to `max_faces`, then halve it while the distance stays within `error`.
+def simplified(fine: AssetSurface, faces: int, error: float, faces_first: bool = False) -> Simplified:
+    """Reduce the number of triangles as far as the distance stays within `error`.
+
+    The number is `faces`, halved as often as the error permits. If `faces` triangles exceed the error, the
+    number is doubled until they do not, or until it is `MAX_FACES`.
 
     Args:
         fine: the surface.
-        max_faces: largest number of triangles, whatever the distance.
-        error: largest distance that a further reduction may cause, scene units.
+        faces: wished number of triangles.
+        error: largest distance, scene units (`Distance.near`).
+        faces_first: use at most `faces` triangles, whatever the distance.
     """
-    count = min(max_faces, len(fine.faces))
+    count, most = min(faces, len(fine.faces)), min(MAX_FACES, len(fine.faces))
     best = _with_faces(fine, count)
+    wished = best.distance
+    if wished.near > error and not faces_first:
+        while best.distance.near > error and count < most:
+            count = min(2 * count, most)
+            best = _with_faces(fine, count)
+        return replace(best, wished=wished)
     while count // 2 >= MIN_FACES:
         count //= 2
         fewer = _with_faces(fine, count)
-        if fewer.distance.near > error or fewer.distance.missed > max(MAX_MISSED, best.distance.missed):
+        if fewer.distance.near > error:
             break
         best = fewer
-    return best
+    return replace(best, wished=wished)
 
 
-def distance_between(fine: AssetSurface, coarse: AssetSurface) -> Distance:
-    """Measure the distance along the normals of the fine surface, at points spread uniformly over it."""
-    points, face = trimesh.sample.sample_surface(fine.mesh(), SAMPLES, seed=0)
-    normals = fine.mesh().face_normals[face]
-    hits = hits_along_normals(coarse, first_hits(coarse), np.asarray(points), normals, REACH)
-    distances = hits.distance[hits.valid]
-    near = float(np.percentile(distances, PERCENTILE)) if len(distances) else REACH
-    return Distance(near, 1 - len(distances) / SAMPLES)
+def distance_between(one: AssetSurface, other: AssetSurface) -> Distance:
+    """Measure the distance from points that are spread uniformly over each surface to the other."""
+    there, back = _distances(one, other), _distances(other, one)
+    near = max(np.percentile(side, PERCENTILE, method="higher") for side in (there, back))
+    return Distance(float(near), float(max(there.max(), back.max())))
+
+
+def _distances(measured: AssetSurface, other: AssetSurface) -> Float[np.ndarray, " S"]:
+    """Distances of points of a surface to another one, along their normals or to the nearest triangle.
+
+    A normal misses the other surface beside its border, and where a part that faces the other way is nearer.
+    """
+    mesh = measured.mesh()
+    points, face = trimesh.sample.sample_surface(mesh, SAMPLES, seed=0)
+    points, normals = np.asarray(points), mesh.face_normals[face]
+    hits = hits_along_normals(other, first_hits(other), points, normals, REACH)
+    distances = np.where(hits.valid, hits.distance, np.inf).astype(np.float64)
+    far = np.argsort(distances)[-max(np.count_nonzero(~hits.valid), SAMPLES // 100) :]
+    distances[far] = np.minimum(distances[far], _to_nearest(other, points[far], normals[far]))
+    return distances
+
+
+def _to_nearest(
+    surface: AssetSurface, points: Float[np.ndarray, "N 3"], normals: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, " N"]:
+    """Distances of points to the nearest triangle that faces the same way; infinite if there is none."""
+    triangles, facing = surface.vertices[surface.faces], surface.mesh().face_normals
+    center = triangles.mean(axis=1)
+    radius = np.linalg.norm(triangles - center[:, None], axis=-1).max()
+    tree = cKDTree(center)
+    distances = np.full(len(points), np.inf)
+    for row, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        _, near = tree.query(point, min(NEIGHBORS, len(center)))
+        same = np.atleast_1d(near)[facing[near] @ normal > 0]
+        if not len(same):
+            same = np.flatnonzero(facing @ normal > 0)
+        if not len(same):
+            continue
+        # The nearest triangle is no farther than the nearest centre, and reaches `radius` around its own.
+        bound = np.linalg.norm(center[same] - point, axis=-1).min() + radius
+        within = np.array(tree.query_ball_point(point, bound * (1 + 1e-9)))
+        candidates = triangles[within[facing[within] @ normal > 0]]
+        nearest = trimesh.triangles.closest_point(candidates, np.tile(point, (len(candidates), 1)))
+        distances[row] = np.linalg.norm(nearest - point, axis=-1).min()
+    return distances
 
 
 def _with_faces(fine: AssetSurface, count: int) -> Simplified:
-    """Decimate by quadric errors (Garland and Heckbert 1997)."""
-    if count >= len(fine.faces):
-        mesh = fine.mesh()
-    else:
-        vertices, faces = fast_simplification.simplify(
-            fine.vertices.astype(np.float32), fine.faces.astype(np.int32), target_count=count
-        )
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
+    """A surface with `count` triangles or fewer, and its distance."""
+    mesh = fine.mesh() if count >= len(fine.faces) else _decimated(fine, count)
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
     surface = creased(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces))
-    return Simplified(surface, distance_between(fine, surface))
+    unchanged = count >= len(fine.faces)
+    distance = Distance(0.0, 0.0) if unchanged else distance_between(fine, surface)
+    return Simplified(surface, distance, distance)
+
+
+def _decimated(fine: AssetSurface, count: int) -> trimesh.Trimesh:
+    """Decimate by quadric errors (Garland and Heckbert 1997)."""
+    for aggressiveness, keeps_borders in WAYS:
+        vertices, faces = fast_simplification.simplify(
+            fine.vertices,
+            fine.faces.astype(np.int32),
+            target_count=count,
+            agg=aggressiveness,
+            preserve_border=keeps_borders,
+        )
+        if len(faces) <= count:
+            break
+    return trimesh.Trimesh(vertices, faces, process=False)

@@ -87,7 +87,7 @@ def write_ball(
     out: Path,
     size: int = 256,
     faces: int = 600,
-    error: float = 0.0,
+    error: float | None = None,
     deviations=None,
     resolution: int = 48,
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,12 @@ import trimesh
 
 from neilfpp_method.cli import main
 from neilfpp_method.data.files.images import read_image
+from neilfpp_method.export.asset import command as asset_command
+from neilfpp_method.export.asset.clean import HOLE
 from neilfpp_method.train.run import load_run
-from tests.calls import refused, train_tiny
+from tests.calls import refused, train_tiny, tree
 from tests.data.make_capture import CENTER, RADIUS, SCALE, srgb
+from tests.export.empty_field import without_surface
 from tests.train.small_runs import small_config, solved_light
 
 SMALL = ["--device", "cpu", "--texture-size", "128", "--faces", "400", "--resolution", "32"]
@@ -76,6 +80,8 @@ def test_an_asset_of_a_given_mesh(given, tmp_path, capfd):
         (["--faces", "3"], ("an asset cannot have 3 triangles", "--faces")),
         (["--error", "-1"], ("--error cannot be -1",)),
         (["--error", "nan"], ("--error cannot be nan",)),
+        (["--holes", "-0.1"], ("--holes cannot be -0.1", "scene units")),
+        (["--holes", "nan"], ("--holes cannot be nan",)),
         (["--out", "FILE/out"], ("cannot be written",)),
     ],
 )
@@ -86,8 +92,61 @@ def test_bad_options_are_refused(given, tmp_path, capfd, options, words):
     refused(capfd, command, *words, leaves=tmp_path)
 
 
-def test_a_run_without_a_material(masked_capture, tmp_path, capfd):
-    run = train_tiny(masked_capture, tmp_path / "run")
+@pytest.fixture(scope="module")
+def found(tmp_path_factory, masked_capture) -> Path:
+    """A run with a recovered surface, and a light that is free at every point."""
+    return train_tiny(masked_capture, tmp_path_factory.mktemp("found") / "run")
+
+
+def test_an_error_is_kept_before_the_number_of_triangles(given, tmp_path, capfd):
+    """With --faces alone, 100 triangles are what the user gets."""
+
+    def exported(*options: str) -> tuple[int, str]:
+        out = tmp_path / str(len(list(tmp_path.iterdir())))
+        command = ["export", str(given), "--what", "asset", "--out", str(out), "--device", "cpu", *options]
+        assert main([*command, "--texture-size", "512"]) == 0
+        shape = trimesh.load(out / "asset" / "asset.glb", process=False).geometry["surface"]
+        return len(shape.faces), capfd.readouterr().out
+
+    few, said = exported("--faces", "100")
+    assert few <= 100
+    assert "to keep the error" not in said
+    more, said = exported("--faces", "100", "--error", "0.002")
+    assert more > 100
+    assert "more than 100 triangles, to keep the error" in said
+
+
+def test_the_width_of_closed_holes(given, tmp_path, monkeypatch):
+    widths = []
+    monkeypatch.setattr(asset_command, "clean", lambda full, seen, hole: widths.append(hole) or full)
+    command = ["export", str(given), "--what", "asset", "--out", str(tmp_path), *SMALL]
+    assert main(command) == 0
+    assert main([*command, "--holes", "0.2"]) == 0
+    assert widths == [HOLE, 0.2]
+
+
+def test_an_atlas_that_does_not_fit(found, tmp_path, capfd):
+    """The extracted surface is kept for the next try, and nothing else is written."""
+    run = shutil.copytree(found, tmp_path / "run")
+    command = ["export", run, "--what", "asset", "--device", "cpu", "--resolution", 96, "--error", 0]
+    words = ("charts of", "do not fit on a texture of 64×64", "raise --texture-size")
+    before = tree(run)
+    command = [*command, "--texture-size", 64]
+    assert main([*map(str, command)]) == 2
+    after = tree(run)
+    assert {path.name for path in after.keys() - before.keys()} == {"surface-96.npz"}
+    assert {path: after[path] for path in before} == before
+    refused(capfd, command, *words, leaves=tmp_path)
+
+
+def test_a_run_without_a_surface(found, tmp_path, capfd):
+    run = without_surface(found, tmp_path / "run")
+    command = ["export", run, "--what", "asset", *SMALL]
+    refused(capfd, command, "no surface within", "train the stage sdf_init for longer", leaves=tmp_path)
+
+
+def test_a_run_without_a_material(found, tmp_path, capfd):
+    run = shutil.copytree(found, tmp_path / "run")
     command = ["export", run, "--what", "asset", "--checkpoint", "sdf_init", *SMALL]
     refused(capfd, command, "no material at step 4", leaves=tmp_path)
     # A later step has a material, on the recovered surface; the light is free at every point, so there is

@@ -1,6 +1,4 @@
-"""The surface of an asset: visible parts without small components and small holes, with as few triangles as
-the error permits.
-"""
+"""The surface of an asset: visible parts without small components and small holes."""
 
 from __future__ import annotations
 
@@ -11,9 +9,10 @@ import trimesh
 from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.asset.clean import HOLE, clean, close_holes, keep_visible, remove_small_components
-from neilfpp_method.export.asset.simplify import distance_between, simplified
 from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, hits_along_normals
 from neilfpp_method.export.asset.visible import visible_faces
+
+CAPS = [(np.array([0.0, 0.0, 0.5]), 0.06), (np.array([0.5, 0.0, 0.0]), 0.2)]
 
 
 def surface(*shapes: trimesh.Trimesh) -> AssetSurface:
@@ -103,13 +102,30 @@ def test_small_holes_are_closed_and_large_ones_kept():
         assert found.valid[0] == met
 
 
+@pytest.mark.parametrize(("hole", "patches"), [(0.0, 0), (0.2, 1), (0.6, 2)])
+def test_the_size_of_closed_holes_is_an_option(hole, patches):
+    """Caps with diameters of 0.12 and 0.4 are unseen, and are kept or removed like holes."""
+    shape = surface(ball((0, 0, 0), 0.5, 5))
+    middle = shape.mesh().triangles_center
+    caps = [np.linalg.norm(middle - place, axis=1) < width for place, width in CAPS]
+    seen = ~(caps[0] | caps[1])
+    kept = keep_visible(shape, seen, hole).mesh()
+    assert (
+        sum(np.linalg.norm(kept.triangles_center - place, axis=1).min() < 0.02 for place, _ in CAPS)
+        == patches
+    )
+    closed = close_holes(shape.part(seen), hole)
+    assert len(closed.vertices) - len(shape.vertices) == patches
+    assert len(clean(shape, seen, hole).faces) == len(kept.faces)
+
+
 def test_no_visible_triangle_is_an_error():
     shape = surface(ball((0, 0, 0), 0.5))
     with pytest.raises(UserError, match="no training camera sees the surface"):
         clean(shape, np.zeros(len(shape.faces), dtype=bool))
 
 
-# ------------------------------------------------------------------------------------------------ simplifying
+# ------------------------------------------------------------------------------------- the surface of a point
 
 
 def test_points_are_moved_to_the_surface_of_the_same_orientation():
@@ -129,38 +145,3 @@ def test_points_are_moved_to_the_surface_of_the_same_orientation():
     )
     assert not short.valid.any()
     np.testing.assert_allclose(short.position, [[0.1, 0.2, 0.03]], atol=1e-6)
-
-
-def test_the_number_of_triangles_depends_on_the_error():
-    fine = surface(ball((0, 0, 0), 0.5, 5))
-    sizes = []
-    for error in (0.0, 0.003, 0.02):
-        coarse = simplified(fine, 5000, error)
-        assert len(coarse.surface.faces) <= 5000
-        assert coarse.distance.near <= max(error, simplified(fine, 5000, 0.0).distance.near)
-        # The centre of a triangle with edges of length e lies e²/(6 r) below its corners, which all of them
-        # must keep.
-        sphere = np.linalg.norm(coarse.surface.mesh().triangles_center, axis=1)
-        assert np.abs(sphere - 0.5).mean() <= max(error, 0.001)
-        sizes.append(len(coarse.surface.faces))
-    assert sizes[0] > sizes[1] > sizes[2]
-
-
-def test_the_distance_is_that_between_the_surfaces():
-    one, other = surface(ball((0, 0, 0), 0.5, 5)), surface(ball((0, 0, 0), 0.51, 5))
-    assert distance_between(one, other).near == pytest.approx(0.01, abs=3e-4)
-    assert distance_between(one, one).near == pytest.approx(0, abs=1e-5)
-    assert distance_between(one, other).missed == 0
-    # If half of the surface is missing, half of the points are missed.
-    half = one.part(one.mesh().triangles_center[:, 2] > 0)
-    assert distance_between(one, half).missed == pytest.approx(0.5, abs=0.02)
-
-
-def test_a_coarse_surface_is_unchanged():
-    box = surface(trimesh.creation.box((1, 1, 1)))
-    kept = simplified(box, 5000, 0.0)
-    assert len(kept.surface.faces) == 12
-    # Edges stay edges: each corner has the normal of its side.
-    np.testing.assert_allclose(
-        kept.surface.normals, np.repeat(box.mesh().face_normals[:, None], 3, axis=1), atol=1e-6
-    )
