@@ -19,6 +19,8 @@ from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.point_cloud import load_point_cloud
 from neilfpp_method.data.truth import Truth
 from neilfpp_method.effects.evidence.exposure import Exposures, measure_exposures
+from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import record_exposures
 from neilfpp_method.errors import UserError
 from neilfpp_method.fields import PoseCorrections
 from neilfpp_method.hosts.base import Host
@@ -35,6 +37,7 @@ __all__ = [
     "cloud_summary",
     "exposures_at_cloud",
     "initial_model",
+    "measure_facts",
     "scene_facts",
     "show_known_light",
 ]
@@ -54,7 +57,7 @@ BRIGHT_QUANTILE = 0.999
 """R also reaches this quantile of the radiance of HDR images. The brightest pixels are excluded because a
 single lamp in view should not set the scale of R.
 """
-LARGE = 2.0
+MAX_MEDIAN_DISTANCE = 2.0
 """Median distance of a mesh from the centre above which it is too large rather than inside out, scene
 units."""
 VISIBILITY_STRIDE = 67
@@ -92,6 +95,25 @@ def scene_facts(
         far_points=capture.scene_from == "focus",
         log_gains=() if log_gains is None else tuple(log_gains.flatten().tolist()),
     )
+
+
+def measure_facts(plan: Plan, capture: Capture, pixels: PixelDataset) -> SceneFacts:
+    """`scene_facts` with the settings of a plan, after the decision whether photographs have gains."""
+    return scene_facts(capture, pixels, plan.config, _log_gains(plan, capture, pixels))
+
+
+def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
+    """Initial log gains of the photographs, after the decision whether photographs have gains.
+
+    Returns None if they have none, and zeros if they are requested but cannot be measured.
+    """
+    if not plan.is_on("exposure"):
+        return None
+    exposures = exposures_at_cloud(capture, pixels)
+    record_exposures(plan, exposures)
+    if not plan.is_on("exposure"):
+        return None
+    return torch.zeros(len(pixels.views), 3) if exposures is None else exposures.log_gain
 
 
 def exposures_at_cloud(capture: Capture, pixels: PixelDataset) -> Exposures | None:
@@ -188,7 +210,7 @@ def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
         raise UserError(f"{path}: no camera sees this mesh", "give it in the world frame of the capture")
     if outside.float().mean() < 0.5:
         reach = torch.cat([hits.position for hits in met]).norm(dim=-1).median().item()
-        if reach > LARGE:
+        if reach > MAX_MEDIAN_DISTANCE:
             raise UserError(
                 f"{path}: the cameras are inside of this mesh, half of which is {reach:.3g} or more scene "
                 "units from the centre",

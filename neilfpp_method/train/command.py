@@ -8,17 +8,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from lightning_fabric import Fabric
 from rich.console import Console
-from torch import Tensor
 
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.data.pixels.held_back import PATCHES, hold_back
 from neilfpp_method.data.pixels.object_source import object_line, object_sources, stored_masks
 from neilfpp_method.effects.plan import Plan
-from neilfpp_method.effects.review import record_exposures, record_facts
+from neilfpp_method.effects.review import record_facts
 from neilfpp_method.effects.table import effects_table
 from neilfpp_method.errors import Unsound
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
@@ -34,9 +32,8 @@ from neilfpp_method.train.budgeted import close_budget, outcome
 from neilfpp_method.train.build import (
     build_model,
     cloud_summary,
-    exposures_at_cloud,
     initial_model,
-    scene_facts,
+    measure_facts,
 )
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.device import pick_device, waiting
@@ -107,9 +104,9 @@ def run_training(
             training = _train(request, run, prepared, ledger, console)
     if fabric.is_global_zero:
         _finish(run, training, console, at_end)
-    health = training.watch.health
-    if request.strict and health.verdict == "failed":
-        raise Unsound(f"{run.out}: {health.findings[0].what}", health.findings[0].remedy)
+    failure = training.watch.health.failure
+    if request.strict and failure is not None:
+        raise Unsound(f"{run.out}: {failure.what}", failure.remedy)
     return run.out
 
 
@@ -138,7 +135,7 @@ class _Prepared:
 def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
     """Read the pixels, build the model, and create the folder of a new run."""
     pixels = load_training_pixels(run.capture, run.out / PIXELS, fabric, console)
-    facts = _measure_facts(run, pixels) if run.facts is None else run.facts
+    facts = measure_facts(run.plan, run.capture, pixels) if run.facts is None else run.facts
     record_facts(run.plan, facts)
     config = run.plan.config_of_model
     untrained = not last_checkpoint(run.out).exists()
@@ -155,25 +152,6 @@ def _prepare(run: OpenRun, fabric: Fabric, console: Console) -> _Prepared:
     if start:
         console.print(start.text, style="yellow" if start.warning else None, soft_wrap=True)
     return _Prepared(fabric, pixels, config, model, untrained)
-
-
-def _measure_facts(run: OpenRun, pixels: PixelDataset) -> SceneFacts:
-    gains = _log_gains(run.plan, run.capture, pixels)
-    return scene_facts(run.capture, pixels, run.plan.config, gains)
-
-
-def _log_gains(plan: Plan, capture: Capture, pixels: PixelDataset) -> Tensor | None:
-    """Initial log gains of the photographs, after the decision whether photographs have gains.
-
-    Returns None if they have none, and zeros if they are requested but cannot be measured.
-    """
-    if not plan.is_on("exposure"):
-        return None
-    exposures = exposures_at_cloud(capture, pixels)
-    record_exposures(plan, exposures)
-    if not plan.is_on("exposure"):
-        return None
-    return torch.zeros(len(pixels.views), 3) if exposures is None else exposures.log_gain
 
 
 def _create(run: OpenRun, facts: SceneFacts) -> None:
@@ -284,7 +262,7 @@ def _train(
 
 def _watch(pixels: PixelDataset, config: NeilfConfig, reporter: Reporter) -> Watch:
     seed_stream(config.train.seed, Stream.HEALTH)
-    return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn)
+    return Watch(pixels.sample(CHECKED_PIXELS, gradients=False), reporter.warn, reporter.say)
 
 
 def _preview(out: Path, fabric: Fabric, reporter: Reporter) -> Callable[[NeilfModel, Capture, Stage], None]:

@@ -1,0 +1,151 @@
+"""Decide on effects by evidence, and set light and material, between the steps of a training.
+
+All training loops call these functions after the same steps. Their random numbers depend only on the seed and
+the number of the step, so all loops decide alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
+from neilfpp_method.effects.plan import Decision, Plan
+from neilfpp_method.effects.review import (
+    MAX_PIXELS,
+    MIN_PIXELS,
+    improve_material,
+    light_places,
+    needs_surface,
+    record_lamps,
+    review_light,
+    review_material,
+    review_metals,
+    review_surface,
+)
+from neilfpp_method.lighting.fit import Evidence
+from neilfpp_method.lighting.solver import LightSolver
+from neilfpp_method.model import NeilfModel
+from neilfpp_method.schedule import StagePosition
+from neilfpp_method.train.optimizer import Stream, seed_stream
+
+__all__ = [
+    "Subject",
+    "follow",
+    "follow_fit",
+    "improve_half_trained",
+    "is_improvement_due",
+    "review_before_material",
+]
+
+Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
+"""Measures with the model after so many steps and adds its decisions to the plan."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is measured, and what follows the decisions.
+
+    Attributes:
+        plan: the effects; decisions are added to it.
+        model: the model in training, which uses the settings of the plan.
+        light_solver: fits the light of this model.
+        pixels: the training pixels, on the device of the model.
+        seed: seed of the training.
+        say: prints a line.
+        max_pixels: maximum number of pixels of the places for the initial light; a budget may limit it.
+    """
+
+    plan: Plan
+    model: NeilfModel
+    light_solver: LightSolver
+    pixels: PixelDataset
+    seed: int
+    say: Callable[[str], object]
+    max_pixels: int = MAX_PIXELS
+
+
+def review_before_material(subject: Subject, step: int) -> Evidence | None:
+    """Take the measurements before a stage that trains material, and set the initial light.
+
+    Args:
+        subject: what is measured.
+        step: number of steps trained so far.
+
+    Returns:
+        The evidence for lamps in the initial light; None if no light was set or the settings decide.
+    """
+    _review(subject, step, review_surface, Stream.SURFACE)
+    evidence = _start_light(subject, step)
+    _review(subject, step, review_material, Stream.MATERIAL)
+    return evidence
+
+
+def follow_fit(subject: Subject, evidence: Evidence | None, step: int) -> None:
+    """Record what a fit of the light after `step` steps has decided on lamps."""
+    follow(subject, record_lamps(subject.plan, evidence, subject.model.lamps.count, step))
+
+
+def is_improvement_due(subject: Subject, position: StagePosition) -> bool:
+    """Whether `improve_half_trained` is due after `position.step` steps of a stage."""
+    return subject.max_pixels >= MIN_PIXELS and is_comparison_due(subject.model, position)
+
+
+def improve_half_trained(subject: Subject, position: StagePosition, step: int) -> None:
+    """Correct the scale of light and material, and review metals (`effects.review`).
+
+    This may change the light and train the BRDF field.
+
+    Args:
+        subject: what is measured.
+        position: the stage, and the number of steps trained in it.
+        step: number of steps trained so far in all stages.
+    """
+    model, solver = subject.model, subject.light_solver
+    if not (model.brdf.metals or subject.plan.is_open("metals") or solver.scale_is_free):
+        return
+    seed_stream(subject.seed, Stream.SEARCH, step)
+    places, with_search = light_places(model, subject.pixels, subject.max_pixels), is_search_due(position)
+    improved = improve_material(model, solver, places, with_search)
+    if improved is None:
+        return
+    for summary in improved.summaries:
+        subject.say(summary)
+    if with_search:
+        follow(subject, review_metals(subject.plan, model, improved.lit, step))
+
+
+def follow(subject: Subject, decisions: Sequence[Decision]) -> None:
+    """Print decisions, and use the settings that follow from the plan."""
+    for decision in decisions:
+        subject.say(decision.summary())
+    if decisions:
+        config = subject.plan.config
+        subject.model.use(config)
+        subject.light_solver.use(config.light, subject.model.lobe)
+
+
+def _review(subject: Subject, step: int, review: Review, stream: Stream) -> None:
+    """Decide open effects by evidence, with the random numbers of a stream."""
+    if needs_surface(subject.plan):
+        seed_stream(subject.seed, stream, step)
+        follow(subject, review(subject.plan, subject.model, subject.pixels, step))
+
+
+def _start_light(subject: Subject, step: int) -> Evidence | None:
+    """Set the initial light, after the decisions on lobe and metals. Returns the evidence for lamps."""
+    model, solver = subject.model, subject.light_solver
+    if not solver.seeks_start:
+        return None
+    subject.say("fitting light and material at selected places, to decide on effects …")
+    seed_stream(subject.seed, Stream.LIGHT, step)
+    review = review_light(subject.plan, model, subject.pixels, step, subject.max_pixels)
+    follow(subject, review.decisions)
+    if review.first is None:
+        return None
+    subject.say(review.first.summary())
+    evidence = start_with(model, solver, review.first)
+    follow_fit(subject, evidence, step)
+    return evidence
