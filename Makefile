@@ -35,7 +35,8 @@ test-slow: $(VENV)/.installed-dev
 test-hard: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(RUN)/python -m pytest tests/hard_cases -m hard -n 2 --dist load
 
-# Nerfstudio pins a different OpenCV package, so its tests have a separate environment.
+# Nerfstudio pins a different OpenCV package, so its tests have a separate environment. The .pth file lets the
+# ns-* commands start in it by hand (tests_nerfstudio/cpu_torchvision.py).
 NERFSTUDIO := .venv-nerfstudio
 NERFSTUDIO_PINS := tests_nerfstudio/requirements.txt tests_nerfstudio/requirements-no-deps.txt
 
@@ -44,6 +45,8 @@ $(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
 	$(NERFSTUDIO)/bin/python -m pip install --quiet --disable-pip-version-check -r tests_nerfstudio/requirements.txt
 	$(NERFSTUDIO)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
 		-r tests_nerfstudio/requirements-no-deps.txt --editable .
+	printf '%s\nimport tests_nerfstudio.cpu_torchvision\n' '$(CURDIR)' > "$$($(NERFSTUDIO)/bin/python -c \
+		'import sysconfig; print(sysconfig.get_path("purelib"))')/neilfpp_tests.pth"
 	touch $@
 
 test-nerfstudio: $(NERFSTUDIO)/.installed

@@ -13,15 +13,11 @@ pytest.importorskip(
     "nerfstudio", reason="nerfstudio is not installed here: `make test-nerfstudio` has its own environment"
 )
 
-# torchvision's wheels are CUDA builds: with a CPU build of torch two operators have no schema, and its import
-# fails.
-OPERATORS = torch.library.Library("torchvision", "DEF")
-OPERATORS.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-OPERATORS.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-
-import torchmetrics.image.lpip  # noqa: E402
-from nerfstudio.field_components.encodings import HashEncoding  # noqa: E402
-from nerfstudio.fields import sdf_field  # noqa: E402
+# Must be imported before torchvision.
+import tests_nerfstudio.cpu_torchvision  # noqa: F401, I001
+import torchmetrics.image.lpip
+from nerfstudio.field_components.encodings import HashEncoding
+from nerfstudio.fields import sdf_field
 
 
 class TorchEncoding(HashEncoding):

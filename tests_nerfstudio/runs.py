@@ -47,7 +47,7 @@ def reduced_tabletop(root: Path) -> Path:
 
 def small_settings(**steps: int) -> NeilfConfig:
     """The tiny settings with the light of the preset, fitted at every third step, and four steps per stage
-    unless `steps` changes it.
+    unless `steps` changes it. Photographs have one exposure.
     """
     config, usual = small_config(**steps), preset("fast")
     fit = LightFitConfig(points=48, every=3)
@@ -56,16 +56,22 @@ def small_settings(**steps: int) -> NeilfConfig:
         volume=dataclasses.replace(config.volume, beta_final=usual.volume.beta_final),
         light=dataclasses.replace(usual.light, environment_height=8, fit=fit),
         inter_reflection=dataclasses.replace(config.inter_reflection, mode=usual.inter_reflection.mode),
+        optimizer=dataclasses.replace(config.optimizer, exposure=0.0),
     )
 
 
 def trainer_config(
-    data: Path, out: Path, settings: NeilfConfig, host: str | None = None, method: str = "neilfpp"
+    data: Path,
+    out: Path,
+    settings: NeilfConfig,
+    host: str | None = None,
+    method: str = "neilfpp",
+    effects: str = "as-set",
 ) -> TrainerConfig:
     """The configuration that `ns-train neilfpp --data … --pipeline.model.host …` is parsed to."""
     config = copy.deepcopy(all_methods[method])
     model, pixels = config.pipeline.model, config.pipeline.datamanager
-    model.neilf, model.host = settings, host
+    model.neilf, model.host, model.effects = settings, host, effects
     pixels.train_num_rays_per_batch = pixels.eval_num_rays_per_batch = settings.train.rays
     config.machine.device_type, config.vis = "cpu", "tensorboard"
     config.max_num_iterations = sum(stage_steps(settings.train).values())

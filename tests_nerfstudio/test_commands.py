@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import pytest
 import tyro
@@ -32,13 +33,25 @@ def test_every_entry_point_of_the_package_exists() -> None:
                 assert entry.name in known
 
 
-def test_ns_train_help_lists_the_method(capsys) -> None:
-    with pytest.raises(SystemExit) as stop:
-        tyro.cli(AnnotatedBaseConfigUnion, args=["--help"])
-    assert stop.value.code in (0, None)
-    shown = capsys.readouterr().out
-    assert "neilfpp" in shown
-    assert "nerfacto" in shown
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("ns-train", ["neilfpp", "neilfpp-mesh", "nerfacto"]),
+        ("ns-export", ["pointcloud", "marching-cubes"]),
+        ("ns-render", ["dataset"]),
+    ],
+)
+def test_the_commands_start_by_hand(command: str, words: list[str], tmp_path: Path) -> None:
+    # In a folder and a process that know nothing of the tests.
+    done = subprocess.run(
+        [Path(sys.executable).parent / command, "--help"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    assert all(word in done.stdout for word in words)
 
 
 def test_the_command_line_reaches_the_settings() -> None:

@@ -13,6 +13,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.process_data.colmap_utils import colmap_to_json
 
 from neilfpp_method.data.cameras.lens import Lens
@@ -252,6 +253,22 @@ def test_nerfstudio_reads_the_exported_capture(tmp_path: Path) -> None:
             theirs, ours = outputs.cameras.generate_rays(camera_indices=i).flatten(), camera_rays(view.camera)
             torch.testing.assert_close(theirs.origins, ours.origins, atol=1e-5, rtol=0)
             torch.testing.assert_close(theirs.directions, ours.directions, atol=1e-5, rtol=0)
+
+
+def test_exr_images_in_other_methods_and_dataparsers_are_refused(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"\.exr: this part of nerfstudio cannot read EXR .*neilfpp-data"):
+        InputDataset(parsed(root))[0]
+    config = NerfstudioDataParserConfig(data=write_transforms(load_capture(root), tmp_path))
+    with pytest.raises(UserError, match=r"\.exr: this part of nerfstudio cannot read EXR"):
+        config.setup().get_dataparser_outputs("train")
+
+
+def test_a_device_that_is_not_there_is_refused(root: Path, monkeypatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    manager = CaptureDataManagerConfig(dataparser=CaptureParserConfig(data=root))
+    for device in ("cuda", "cuda:0"):
+        with pytest.raises(UserError, match=r"no CUDA device; .*--machine\.device-type cpu"):
+            manager.setup(device=device)
 
 
 def test_rescaled_views_are_refused(root: Path) -> None:

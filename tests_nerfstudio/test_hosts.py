@@ -8,9 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 from nerfstudio.cameras.rays import RayBundle
+from nerfstudio.configs.method_configs import method_configs
+from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManagerConfig
 from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.fields import sdf_field
 from nerfstudio.models.base_model import Model, ModelConfig
+from nerfstudio.scripts.exporter import ExportPointCloud
+from nerfstudio.utils import external
 from torch import nn
 from torch.nn.functional import normalize
 
@@ -18,6 +24,7 @@ from neilfpp_method.data.views import Normalization
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts import proxy
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
+from neilfpp_method.plugin import foreign
 from neilfpp_method.plugin import steps as plugin_steps
 from neilfpp_method.plugin.foreign import build_foreign
 from neilfpp_method.schedule import Stage
@@ -195,10 +202,42 @@ def test_the_weight_of_a_hosts_own_losses_is_a_setting(tmp_path: Path) -> None:
     assert none["eikonal"] > 0.0, "ours stands in for it"
 
 
-def test_a_host_that_does_not_render_rays_or_does_not_exist_is_refused() -> None:
-    for name in ("splatfacto", "nonsense"):
-        with pytest.raises(UserError, match="neus"):
-            build_foreign(name, ARGUMENTS)
+@pytest.mark.parametrize(
+    ("name", "words"), [("splatfacto", "not render all"), ("tensorf", "not render all"), ("vrml", "no such")]
+)
+def test_what_cannot_be_a_host_is_refused(name: str, words: str) -> None:
+    with pytest.raises(UserError, match=rf"no host '{name}': .*{words}.*nerfacto, .*, neus-facto$"):
+        build_foreign(name, ARGUMENTS)
+
+
+def test_the_hosts_are_the_methods_that_can_render_and_train_as_hosts(monkeypatch) -> None:
+    def works(name: str) -> bool:
+        try:
+            host = NerfstudioHost(build_foreign(name, ARGUMENTS).model, own_losses=True).train()
+            own = host.render_regularized(sphere_batch(4), {"volume"}).terms["own"].mean()
+        except (AssertionError, ImportError, KeyError, OSError, UserError):
+            # Besides missing outputs: semantics and depths that are not there, and kernels for a GPU.
+            return False
+        return bool(own.isfinite())
+
+    rendering = [
+        name
+        for name, method in method_configs.items()
+        if isinstance(method.pipeline.datamanager, VanillaDataManagerConfig)
+    ]
+    hosts = foreign.HOSTS
+    monkeypatch.setattr(foreign, "HOSTS", rendering)
+    assert [name for name in rendering if works(name)] == [name for name in rendering if name in hosts]
+    assert set(hosts) <= set(rendering)
+
+
+def test_a_host_without_its_hash_grid_is_refused(monkeypatch) -> None:
+    monkeypatch.setattr(sdf_field, "tcnn", external.tcnn)
+    monkeypatch.setattr(external, "TCNN_EXISTS", False)
+    for found, remedy in ((False, "needs a CUDA device"), (True, "install it")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda found=found: found)
+        with pytest.raises(UserError, match=rf"host neus needs tiny-cuda-nn .*; .*{remedy}.*nerfacto"):
+            build_foreign("neus", ARGUMENTS)
 
 
 @pytest.mark.parametrize("name", ["neus", "nerfacto"])
@@ -242,3 +281,7 @@ def test_a_foreign_host_logs_the_proxy_and_unsupported_commands(tmp_path: Path, 
     assert "no run folder for the neilfpp commands: the host neus belongs to nerfstudio" in said
     with pytest.raises(UserError, match="no run folder neilfpp/ beside it"):
         run_folder(run / "config.yml")
+    ExportPointCloud(
+        run / "config.yml", tmp_path, num_points=20, num_rays_per_batch=64, remove_outliers=False
+    ).main()
+    assert len(trimesh.load(tmp_path / "point_cloud.ply").vertices) >= 20

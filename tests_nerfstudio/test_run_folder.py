@@ -7,10 +7,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from neilfpp_method.cli import main
+from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.health.cases import verdict_of
 from neilfpp_method.plugin.model import NeilfMethod
 from neilfpp_method.plugin.steps import Steps
@@ -42,12 +44,26 @@ def test_the_run_folder_holds_the_weights_of_the_checkpoint(run: Path) -> None:
     assert differences(weights(run), dict(loaded.model.state_dict())) == []
 
 
-def test_the_commands_accept_the_configuration(run: Path) -> None:
-    config = str(run / "config.yml")
+def test_the_commands_accept_the_configuration(run: Path, tmp_path: Path) -> None:
+    config, results = str(run / "config.yml"), run / "neilfpp"
     assert main(["export", config, "--what", "mesh", "--resolution", "32"]) == 0
     assert main(["eval", config]) == 0
-    assert (run / "neilfpp" / "export" / "mesh.ply").stat().st_size > 1000
-    assert json.loads((run / "neilfpp" / "metrics.json").read_text())
+    assert main(["report", config, "--views", "1"]) == 0
+    assert (results / "export" / "mesh.ply").stat().st_size > 1000
+    assert json.loads((results / "metrics.json").read_text())
+    assert "base colour" in (results / "report.html").read_text().lower()
+
+    # Twice the light gives twice the radiance, from the same random numbers.
+    sky, pictures = np.full((6, 12, 3), 0.5, np.float32), []
+    for name, gain in (("dim", 1.0), ("bright", 2.0)):
+        write_exr(tmp_path / f"{name}.exr", {"RGB": gain * sky})
+        options = ["--env", str(tmp_path / f"{name}.exr"), "--spp", "2", "--resolution", "32"]
+        assert main(["relight", config, *options]) == 0
+        files = sorted((results / "relit" / name).rglob("*.exr"))
+        assert len(files) == 2, "the two test views"
+        pictures.append(np.stack([read_image(file).pixels for file in files]))
+    assert pictures[0].max() > 0.0
+    np.testing.assert_allclose(pictures[1], 2.0 * pictures[0], rtol=0.01, atol=1e-4)
 
 
 def test_a_configuration_without_a_run_folder_is_refused(tmp_path: Path, capsys) -> None:
@@ -70,7 +86,9 @@ def test_health_is_checked(run: Path) -> None:
     for folder in (run, run / "neilfpp"):
         findings = read_findings(folder)
         assert findings is not None
-        assert verdict_of(findings) in ("sound", "doubtful", "failed")
+        # The light is fitted to 48 points.
+        assert "few_light_points" in [finding.case for finding in findings]
+        assert json.loads((folder / "health.json").read_text())["verdict"] == verdict_of(findings)
 
 
 def test_a_step_that_is_not_finite_is_skipped_and_can_be_repeated(

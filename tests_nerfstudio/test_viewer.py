@@ -31,8 +31,6 @@ def free_port() -> int:
 @contextmanager
 def ns_viewer(config: Path, port: int) -> Iterator[None]:
     """The command in a separate process; it does not end by itself."""
-    code = "import tests_nerfstudio.conftest; from nerfstudio.scripts.viewer import run_viewer"
-    code += "; run_viewer.entrypoint()"
     options = [
         "--load-config",
         str(config),
@@ -42,7 +40,7 @@ def ns_viewer(config: Path, port: int) -> Iterator[None]:
         str(port),
     ]
     process = subprocess.Popen(
-        [sys.executable, "-W", "ignore", "-c", code, *options], stdout=subprocess.DEVNULL
+        [Path(sys.executable).parent / "ns-viewer", *options], stdout=subprocess.DEVNULL
     )
     try:
         yield

@@ -170,7 +170,19 @@ class CaptureDataManagerConfig(VanillaDataManagerConfig):
 
 
 class CaptureDataManager(VanillaDataManager[CaptureDataset]):
-    """Nerfstudio's data manager with float images."""
+    """Nerfstudio's data manager with float images.
+
+    Raises:
+        UserError: if the device is not there: the data manager is the first part of this package that
+            `ns-train` builds, and its default device is CUDA.
+    """
+
+    def __init__(
+        self, config: CaptureDataManagerConfig, device: torch.device | str = "cpu", **options: Any
+    ) -> None:
+        if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+            raise UserError("torch finds no CUDA device", "use one, or add --machine.device-type cpu")
+        super().__init__(config, device, **options)
 
     def setup_train(self) -> None:
         """Set up as nerfstudio does, but with `CaptureRayGenerator`."""

@@ -24,6 +24,7 @@ from neilfpp_method.data.formats.nerfstudio_lens import FISHEYE, lens_from_nerfs
 from neilfpp_method.data.formats.transforms import FLIP
 from neilfpp_method.data.views import Normalization, View
 from neilfpp_method.errors import UserError
+from neilfpp_method.plugin.exr import explain_exr_to_pillow
 
 __all__ = ["CaptureParser", "CaptureParserConfig", "capture_of", "neilfpp_data"]
 
@@ -156,6 +157,7 @@ def _camera(cameras: Cameras, i: int) -> Camera:
     return camera
 
 
+explain_exr_to_pillow()
 neilfpp_data = DataParserSpecification(
     CaptureParserConfig(), "Captures that `neilfpp train` reads, HDR included."
 )

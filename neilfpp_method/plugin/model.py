@@ -15,13 +15,17 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import record_facts
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.foreign import ForeignHost, proxy_for
 from neilfpp_method.hosts.nerfstudio import OWN_LOSSES, NerfstudioHost
 from neilfpp_method.hosts.proxy import SurfaceProxy
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.datamanager import PIXELS, to_pixel_batch
-from neilfpp_method.plugin.foreign import build_foreign
+from neilfpp_method.plugin.effects import begin_plan, restore_decisions, stored_decisions
+from neilfpp_method.plugin.exporting import DistanceField, stored_colors
+from neilfpp_method.plugin.foreign import build_foreign, has_distance_field
 from neilfpp_method.plugin.outputs import method_outputs
 from neilfpp_method.plugin.pictures import material_pictures, view_figures, view_pictures
 from neilfpp_method.plugin.record import RunRecord, no_record
@@ -30,8 +34,8 @@ from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.structures import RayBatch
-from neilfpp_method.train.build import build_model, scene_facts, show_known_light
+from neilfpp_method.structures import PixelBatch, RayBatch, SurfaceHits
+from neilfpp_method.train.build import build_model, measure_facts, show_known_light
 from neilfpp_method.train.optimizer import Stream, adam, seed_stream
 
 __all__ = ["FieldAdamConfig", "NeilfMethod", "NeilfMethodConfig"]
@@ -62,10 +66,25 @@ class NeilfMethodConfig(ModelConfig):
     """
     host_losses: float = 1.0
     """Weight of the regularisers of `host`. With 0 they are replaced by L_Eik if it is a surface model."""
+    effects: str = "auto"
+    """The effects to simulate, as `neilfpp train --effects` takes them, for example auto,-lamps. With auto,
+    evidence decides; with as-set, the settings do.
+    """
     neilf: NeilfConfig = field(default_factory=lambda: preset("fast"))
     """The settings of the method. Of `train`, only the seed and the steps of the stages are used;
     nerfstudio's own camera optimizer can correct poses.
     """
+
+    @property
+    def sdf_field(self) -> str:
+        """The host, if it has a distance field. `ns-export marching-cubes` asks whether this exists.
+
+        Raises:
+            AttributeError: if it has none.
+        """
+        if self.neilf.host.kind == "volsdf" if self.host is None else has_distance_field(self.host):
+            return self.host or self.neilf.host.kind
+        raise AttributeError("the host has no distance field")
 
 
 class NeilfMethod(Model):
@@ -74,6 +93,7 @@ class NeilfMethod(Model):
     The outputs `rgb` and `rgb_volume` are in the response of the capture: linear for HDR captures.
 
     Attributes:
+        plan: the effects that are simulated, and why.
         neilf: the method, on its own host or on a nerfstudio model.
         rates: the learning rates.
         proxy: the surface on which rays are traced for a nerfstudio model; None if none is needed.
@@ -93,22 +113,23 @@ class NeilfMethod(Model):
                 "the data manager is not that of neilfpp",
                 "leave --pipeline.datamanager as `ns-train neilfpp` sets it",
             )
-        settings = self.config.neilf
+        self.plan: Plan = begin_plan(self.config.effects, self.config.neilf)
         self.proxy: SurfaceProxy | None = None
-        facts = scene_facts(pixels.capture, pixels, settings)
+        facts = measure_facts(self.plan, pixels.capture, pixels)
+        record_facts(self.plan, facts)
+        settings = self.plan.config_of_model
         seed_stream(settings.train.seed, Stream.WEIGHTS)
         self.rates = settings.optimizer
         if self.config.host is None:
             self.neilf = build_model(pixels.capture, facts, settings)
         else:
-            self._build_on(self.config.host, facts)
+            self._build_on(self.config.host, facts, settings)
         # A submodule, so that nerfstudio's checkpoints contain it.
         self.light_solver = self.neilf.light_solver()
-        self.steps = Steps(self.neilf, self.light_solver, pixels, settings, self.rates, self.proxy)
+        self.steps = Steps(self.neilf, self.light_solver, pixels, self.plan, self.rates, self.proxy)
 
-    def _build_on(self, name: str, facts: SceneFacts) -> None:
+    def _build_on(self, name: str, facts: SceneFacts, settings: NeilfConfig) -> None:
         """Build the model on top of a nerfstudio method, with a proxy if that cannot trace rays cheaply."""
-        settings = self.config.neilf
         arguments = {"scene_box": self.scene_box, "num_train_data": self.num_train_data, **self.kwargs}
         foreign = build_foreign(name, arguments)
         self.rates = dataclasses.replace(settings.optimizer, geometry=foreign.rate)
@@ -121,17 +142,28 @@ class NeilfMethod(Model):
         self.proxy = proxy_for(host, settings)
         foreign_host = ForeignHost(host, borrowed=False, proxy=self.proxy)
         self.neilf = NeilfModel(foreign_host, settings, facts)
-        self.neilf.observers.append(lambda batch, hits: foreign_host.update_proxy(batch.rays, hits))
+        self.neilf.observers.append(self._update_proxy)
         if self.proxy is not None:
             CONSOLE.log(
                 f"{name} cannot trace rays cheaply: shadows and inter-reflection are traced on a proxy of "
                 "its surface that is built from the training rays"
             )
 
+    def _update_proxy(self, batch: PixelBatch, hits: SurfaceHits) -> None:
+        """Add the hits of a training step to the proxy, which only traces rays between surfaces."""
+        if self.steps.traces:
+            self.neilf.host.update_proxy(batch.rays, hits)
+
     @property
     def stage(self) -> Stage:
         """The stage of the current or last step; the first stage before training."""
         return self.steps.position.stage
+
+    @property
+    def field(self) -> nn.Module | DistanceField:
+        """The distance field that `ns-export marching-cubes` reads; see `NeilfMethodConfig.sdf_field`."""
+        host = self.neilf.host
+        return host.inner.model.field if isinstance(host, ForeignHost) else DistanceField(host.sdf)
 
     def get_param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by field."""
@@ -167,7 +199,7 @@ class NeilfMethod(Model):
         if obstacle:
             CONSOLE.log(f"no run folder for the neilfpp commands: {obstacle}")
         else:
-            self.steps.record = RunRecord.of(trainer, self.config.neilf, self.neilf.facts)
+            self.steps.record = RunRecord.of(trainer, self.plan, self.neilf.facts)
         before = [TrainingCallbackLocation.BEFORE_TRAIN_ITERATION]
         after = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
         return [
@@ -182,6 +214,20 @@ class NeilfMethod(Model):
     def update_to_step(self, step: int) -> None:
         """Set the step after a checkpoint has been loaded."""
         self.steps.number = step
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """The decisions on effects, as plain values for checkpoints."""
+        return stored_decisions(self.plan)
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Restore what `get_extra_state` returned, and use the settings that follow from it.
+
+        Raises:
+            UserError: if the checkpoint was trained with another value of `effects`.
+        """
+        restore_decisions(self.plan, state)
+        self.neilf.use(self.plan.config)
+        self.light_solver.use(self.plan.config.light, self.neilf.lobe)
 
     # ------------------------------------------------------------------------------------------------- losses
 
@@ -215,6 +261,10 @@ class NeilfMethod(Model):
         # Before material is trained, its initial values are not shown.
         maps = self.neilf.maps(rays) if self.steps.has_material else self.neilf.host_maps(rays)
         return method_outputs(self.neilf, rays, maps)
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Display values of an output, and the opacity, for `ns-export`."""
+        return stored_colors(outputs, output_name, self.neilf.facts.response)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]

@@ -31,6 +31,8 @@ def method_outputs(neilf: NeilfModel, rays: RayBatch, maps: Maps) -> dict[str, T
         "metallic": maps.metallic,
         "incident_light": mean_incident_light(neilf, rays, maps),
         "normal": maps.normal,
+        # The name and the range under which `ns-export` looks for normals. Rounding can exceed 1.
+        "normals": (0.5 * (maps.normal + 1.0)).clamp(0, 1),
         "depth": maps.depth,
         "accumulation": maps.opacity,
     }

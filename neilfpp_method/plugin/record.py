@@ -12,12 +12,14 @@ from pathlib import Path
 from nerfstudio.engine.trainer import Trainer
 from torch import nn
 
+from neilfpp_method.effects.plan import Plan
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.dataparser import CaptureParserConfig
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.checkpoint import last_checkpoint, save_checkpoint
+from neilfpp_method.train.effects_record import write_plan
 from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.optimizer import make_optimizer
 from neilfpp_method.train.run import BESIDE_NERFSTUDIO, CaptureSource, create_run
@@ -44,23 +46,25 @@ class RunRecord:
         config: the settings, with the number of rays of nerfstudio's data manager.
         source: the location of the capture and how it is read.
         facts: facts measured in the images.
+        plan: the effects.
     """
 
     path: Path
     config: NeilfConfig
     source: CaptureSource
     facts: SceneFacts
+    plan: Plan
 
     @staticmethod
-    def of(trainer: Trainer, settings: NeilfConfig, facts: SceneFacts) -> RunRecord:
+    def of(trainer: Trainer, plan: Plan, facts: SceneFacts) -> RunRecord:
         """The record of a trainer, next to its `config.yml`."""
         manager = trainer.config.pipeline.datamanager
         parser = manager.dataparser
-        train = dataclasses.replace(settings.train, rays=manager.train_num_rays_per_batch)
-        config = dataclasses.replace(settings, train=train)
+        train = dataclasses.replace(plan.settings.train, rays=manager.train_num_rays_per_batch)
+        config = dataclasses.replace(plan.settings, train=train)
         data = Path(manager.data or parser.data).resolve()
         source = CaptureSource(str(data), parser.test_every, parser.response, parser.format)
-        return RunRecord(Path(trainer.base_dir) / BESIDE_NERFSTUDIO, config, source, facts)
+        return RunRecord(Path(trainer.base_dir) / BESIDE_NERFSTUDIO, config, source, facts, plan)
 
     def save(
         self, model: NeilfModel, light_solver: nn.Module, watch: Watch, trainer: Trainer, steps: int
@@ -74,7 +78,8 @@ class RunRecord:
         """
         self._create()
         write_findings(self.path, watch)
-        optimizer = make_optimizer(model, self.config.optimizer)
+        write_plan(self.path, self.plan)
+        optimizer = make_optimizer(model, self.plan.config.optimizer)
         for theirs in trainer.optimizers.optimizers.values():
             optimizer.state.update(theirs.state)
         save_checkpoint(last_checkpoint(self.path), model, light_solver, optimizer, steps)
@@ -89,6 +94,7 @@ class RunRecord:
         return keep_with_note(self.path, model, moment)
 
     def _create(self) -> None:
-        """Write settings and source unless they have been written."""
+        """Write settings, source and effects unless they have been written."""
         if not (self.path / "config.json").is_file():
             create_run(self.path, self.config, self.source, self.facts)
+            write_plan(self.path, self.plan)

@@ -1,7 +1,7 @@
 """The work before and after each step of nerfstudio's trainer, as the standalone loop does it.
 
 Before a step: the stage, the learning rates and the random numbers. After it: the light, the search for
-materials, the health of the run, and its run folder.
+materials, the health of the run, the effects of the next stage, and the run folder.
 """
 
 from __future__ import annotations
@@ -16,11 +16,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects.first_light import start_with
-from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
 from neilfpp_method.effects.plan import Plan
-from neilfpp_method.effects.request import EffectRequest
-from neilfpp_method.effects.review import improve_material, light_places, review_light
+from neilfpp_method.effects.table import effects_table
 from neilfpp_method.health.guard import StepGuard
 from neilfpp_method.health.watch import CHECKED_PIXELS, Watch
 from neilfpp_method.hosts.proxy import SurfaceProxy
@@ -29,8 +26,16 @@ from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.plugin.record import RunRecord
 from neilfpp_method.schedule import Stage, StagePosition, has_material, stage_at, total_steps
-from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
+from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
+from neilfpp_method.train.deciding import (
+    Subject,
+    follow_fit,
+    improve_half_trained,
+    is_improvement_due,
+    review_before_material,
+)
+from neilfpp_method.train.effects_record import write_plan
 from neilfpp_method.train.health_record import write_findings
 from neilfpp_method.train.optimizer import (
     Stream,
@@ -53,7 +58,7 @@ class Steps:
         neilf: the method.
         light_solver: finds the environment map and the lamps of `neilf` between steps.
         pixels: the training pixels.
-        settings: the settings of the method.
+        plan: the effects, from whose settings the method is built.
         rates: the learning rates.
         proxy: the surface on which rays are traced for a nerfstudio model; None if none is needed.
 
@@ -69,14 +74,15 @@ class Steps:
         neilf: NeilfModel,
         light_solver: nn.Module,
         pixels: PixelDataset,
-        settings: NeilfConfig,
+        plan: Plan,
         rates: OptimizerConfig,
         proxy: SurfaceProxy | None,
     ) -> None:
         self.neilf, self.light_solver, self.pixels = neilf, light_solver, pixels
-        self.settings, self.rates, self.proxy = settings, rates, proxy
-        seed_stream(settings.train.seed, Stream.HEALTH)
-        self.watch = Watch(pixels.sample(CHECKED_PIXELS, gradients=False), CONSOLE.log)
+        self.plan, self.rates, self.proxy = plan, rates, proxy
+        self.settings = plan.config_of_model
+        seed_stream(self.settings.train.seed, Stream.HEALTH)
+        self.watch = Watch(pixels.sample(CHECKED_PIXELS, gradients=False), CONSOLE.log, CONSOLE.log)
         self.guard = StepGuard(self._report_skipped)
         self.record: RunRecord | None = None
         self.number = -1
@@ -96,6 +102,11 @@ class Steps:
         return stage_at(self.number, self.settings.train)
 
     @property
+    def traces(self) -> bool:
+        """Whether rays between surfaces are traced."""
+        return self.neilf.config.inter_reflection.mode != "off"
+
+    @property
     def has_material(self) -> bool:
         """Whether material has been trained."""
         return has_material(self.number + 1, self.settings.train)
@@ -106,11 +117,13 @@ class Steps:
         """Set up the stage if it is new, then the learning rates and the random numbers of the step."""
         self.number, position = step, stage_at(step, self.settings.train)
         if self._set_up_for is None:
-            # `neilfpp train` computes with flushed denormal numbers: ten times as fast, and other roundings.
+            # As in `neilfpp train`, denormal numbers are flushed to zero: arithmetic with them is slow on a
+            # CPU, and the two would round differently.
             self._while_training.enter_context(computing_fast())
+            self.pixels = self.pixels.on(self._device)
         if self._set_up_for is not position.stage:
-            if self.neilf.stages[position.stage].trains_material and self.light_solver.seeks_start:
-                self._start_light(step)
+            if step == 0:
+                self._review_before_stage(step)
             self.neilf.freeze_for(position.stage)
             self._set_up_for = position.stage
         waiting = waiting_fields(self.neilf, self.rates, position)
@@ -132,15 +145,6 @@ class Steps:
         lamps = float(self.neilf.lamps.count)
         return {"lamp_gain": torch.tensor(self._evidence.gain), "lamps": torch.tensor(lamps)}
 
-    def _start_light(self, step: int) -> None:
-        """Set the initial light before material is trained."""
-        seed_stream(self.settings.train.seed, Stream.LIGHT, step)
-        plan = Plan.begin(EffectRequest("as-set"), self.settings)
-        first = review_light(plan, self.neilf, self._pixels_on_device(), step).first
-        if first is not None:
-            CONSOLE.log(first.summary())
-            start_with(self.neilf, self.light_solver, first)
-
     def _report_skipped(self, text: str) -> None:
         """Log a step that was not finite, and store it in the run folder if there is one."""
         if self.record is not None and self._moment is not None:
@@ -160,24 +164,34 @@ class Steps:
         self.watch.after_step(self.neilf.stages[self.position.stage], self._computed, step)
         if self.light_solver.due:
             self.watch.after_fit(self.light_solver.points, step)
-        self._evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene) or self._evidence
-        self._improve_half_trained(step)
+        evidence = self.light_solver.solve(self.neilf.brdf, self.neilf.scene)
+        self._evidence = evidence or self._evidence
+        position = stage_at(step, self.settings.train)
+        subject, reached = self._subject(), dataclasses.replace(position, step=position.step + 1)
+        follow_fit(subject, evidence, step + 1)
+        if is_improvement_due(subject, reached):
+            improve_half_trained(subject, reached, step + 1)
         self._computed = None
 
     def check_and_save(self, trainer: Trainer, step: int) -> None:
-        """Check the health at the end of a stage; write the run folder then and when nerfstudio saves."""
+        """Check the health at the end of a stage, and take the measurements for the next; write the run
+        folder then and when nerfstudio saves.
+        """
         done, position = step + 1, stage_at(step, self.settings.train)
         ends = position.step + 1 == position.length
         if ends:
             self.watch.pixels = self.watch.pixels.to(self._device)
             self.watch.after_stage(self.neilf, self.neilf.stages[position.stage], self.guard.skipped, done)
             CONSOLE.log(f"health after {position.stage.value}: {self.watch.health}")
-            if self.proxy is not None and self.proxy.report() is not None:
+            if self.proxy is not None and self.traces and self.proxy.report() is not None:
                 CONSOLE.log(str(self.proxy.report()))
+            if done < total_steps(self.settings.train):
+                self._review_before_stage(done)
         # The condition under which nerfstudio saves.
         saves = step > 0 and step % trainer.config.steps_per_save == 0
         if ends or saves or done == trainer._start_step + trainer.config.max_num_iterations:
             write_findings(trainer.base_dir, self.watch)
+            write_plan(trainer.base_dir, self.plan)
             if self.record is not None:
                 self.record.save(self.neilf, self.light_solver, self.watch, trainer, done)
 
@@ -187,23 +201,19 @@ class Steps:
             trainer.stop_training = True
 
     def end(self) -> None:
-        """Restore the process-wide settings after training."""
+        """Restore the process-wide settings after training, and print the effects."""
         self._while_training.close()
+        if self.plan.request.base != "as-set":
+            CONSOLE.print(effects_table(self.plan))
 
-    def _improve_half_trained(self, step: int) -> None:
-        """When it is due, correct the scale of light and material, and replace metal by better paint."""
-        position = stage_at(step, self.settings.train)
-        reached = dataclasses.replace(position, step=position.step + 1)
-        if not is_comparison_due(self.neilf, reached):
-            return
-        seed_stream(self.settings.train.seed, Stream.SEARCH, step + 1)
-        places = light_places(self.neilf, self._pixels_on_device())
-        improved = improve_material(self.neilf, self.light_solver, places, is_search_due(reached))
-        for summary in () if improved is None else improved.summaries:
-            CONSOLE.log(summary)
+    def _review_before_stage(self, step: int) -> None:
+        """Decide on effects and set the initial light, after `step` steps, if material is trained next."""
+        if self.neilf.stages[stage_at(step, self.settings.train).stage].trains_material:
+            self._evidence = review_before_material(self._subject(), step) or self._evidence
 
-    def _pixels_on_device(self) -> PixelDataset:
-        return self.pixels.on(self._device)
+    def _subject(self) -> Subject:
+        seed = self.settings.train.seed
+        return Subject(self.plan, self.neilf, self.light_solver, self.pixels, seed, CONSOLE.log)
 
     @property
     def _device(self) -> torch.device:
