@@ -22,6 +22,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 import re
 from dataclasses import dataclass, replace
@@ -35,7 +36,7 @@ from neilfpp_method.data.files.json_entry import write_json
 from neilfpp_method.data.scaling import at_scale
 from neilfpp_method.errors import UserError
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import has_material
+from neilfpp_method.schedule import has_material, total_steps
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig, TrainConfig
@@ -71,6 +72,8 @@ DESCRIBING_FILES = ("capture.json", "scene.json", "environment.json")
 """Files that are written before `config.json`; a folder is a run once it contains `config.json`."""
 HALF_WRITTEN = re.compile(r"\.(capture|scene|environment|config)\.[0-9]+\.json")
 """Temporary names of these files while `replacing` writes them."""
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -232,7 +235,7 @@ def rewrite_training(path: Path, config: TrainConfig) -> None:
 
 
 def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: str = LAST) -> Run:
-    """Load a run from its folder.
+    """Load a run from its folder. A line of the log says if its training has not ended.
 
     Args:
         path: the run folder.
@@ -251,7 +254,12 @@ def load_run(path: Path | str, device: torch.device | str = "cpu", checkpoint: s
     load_weights(model, saved["model"], path)
     model.use(plan.config)
     capture = corrected(capture, model.poses)
-    return Run(path, plan.config, capture, described.facts, model.to(device).eval(), saved["step"])
+    run = Run(path, plan.config, capture, described.facts, model.to(device).eval(), saved["step"])
+    steps = total_steps(run.config.train)
+    if checkpoint == LAST and run.has_material and run.step < steps:
+        remedy = f"continue with: neilfpp train --out {path} --resume"
+        log.warning("%s: trained for %d of %d steps; %s", path, run.step, steps, remedy)
+    return run
 
 
 @dataclass(frozen=True)

@@ -226,6 +226,20 @@ def test_a_finished_run_is_unchanged(whole):
     assert files(whole) == before
 
 
+def test_loading_a_run_that_is_not_finished_says_so(tmp_path, capture, whole, monkeypatch, caplog):
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 6)
+        with pytest.raises(Stopped):
+            run(capture, out, small_config())
+    load_run(whole)
+    load_run(out, checkpoint="sdf_init")
+    assert caplog.messages == []
+    load_run(out)
+    told = f"{out}: trained for 7 of {STEPS} steps; continue with: neilfpp train --out {out} --resume"
+    assert caplog.messages == [told]
+
+
 def test_a_run_keeps_its_settings(tmp_path, capture, whole, monkeypatch):
     out = tmp_path / "run"
     with monkeypatch.context() as patch:
