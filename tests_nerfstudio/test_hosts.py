@@ -21,6 +21,7 @@ from torch import nn
 from torch.nn.functional import normalize
 
 from neilfpp_method.data.views import Normalization
+from neilfpp_method.effects import review
 from neilfpp_method.errors import UserError
 from neilfpp_method.hosts import proxy
 from neilfpp_method.hosts.nerfstudio import NerfstudioHost
@@ -42,6 +43,7 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(proxy, "EXPLORING_BATCHES", 1)
     monkeypatch.setattr(proxy, "EXPLORING_RAYS", 16)
     monkeypatch.setattr(plugin_steps, "CHECKED_PIXELS", 16)
+    monkeypatch.setattr(review, "LIGHT_PIXELS", 16)
 
 
 CENTER, RADIUS = torch.tensor([4.0, -2.0, 1.0]), 1.5
@@ -240,7 +242,8 @@ def test_a_host_without_its_hash_grid_is_refused(monkeypatch) -> None:
             build_foreign("neus", ARGUMENTS)
 
 
-@pytest.mark.parametrize("name", ["neus", "nerfacto"])
+# On a CPU, the places of the scale of light and base colour take NeuS minutes to render.
+@pytest.mark.parametrize("name", [pytest.param("neus", marks=pytest.mark.slow), "nerfacto"])
 def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> None:
     settings = small_settings(sdf_steps=2, material_steps=4, joint_steps=1)
     settings = dataclasses.replace(settings, shading=dataclasses.replace(settings.shading, hit_share=0.05))
