@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.files.environment_map import read_environment
 from neilfpp_method.effects.places.solver import PlaceSolver
-from neilfpp_method.effects.plan import Plan, stored_decision
+from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.health.cases import Health
@@ -237,11 +237,11 @@ class AttachedNeilf(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """The decisions on effects, as plain values for checkpoints."""
-        return {"decisions": [asdict(decision) for decision in self.plan.decisions]}
+        return {"decisions": self.plan.stored()}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` returned, and use the settings that follow from it."""
-        self.plan.decisions[:] = [stored_decision(values, "checkpoint") for values in state["decisions"]]
+        self.plan.restore(state["decisions"], "checkpoint")
         self.model.use(self.plan.config)
         self.light_solver.use(self.plan.config.light, self.model.lobe)
 

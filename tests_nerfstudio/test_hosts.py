@@ -242,8 +242,7 @@ def test_a_host_without_its_hash_grid_is_refused(monkeypatch) -> None:
             build_foreign("neus", ARGUMENTS)
 
 
-# On a CPU, the places of the scale of light and base colour take NeuS minutes to render.
-@pytest.mark.parametrize("name", [pytest.param("neus", marks=pytest.mark.slow), "nerfacto"])
+@pytest.mark.parametrize("name", ["neus", "nerfacto"])
 def test_the_stages_run_on_a_method_of_nerfstudio(name: str, tmp_path: Path) -> None:
     settings = small_settings(sdf_steps=2, material_steps=4, joint_steps=1)
     settings = dataclasses.replace(settings, shading=dataclasses.replace(settings.shading, hit_share=0.05))

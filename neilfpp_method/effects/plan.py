@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from neilfpp_method.effects.catalogue import EFFECTS, switched
@@ -146,6 +146,14 @@ class Plan:
         but none of its parameters, so that checkpoints stay compatible.
         """
         return decided_settings(self.settings, [d for d in self.decisions if d.before_training])
+
+    def stored(self) -> list[dict[str, Any]]:
+        """The decisions as plain values, for checkpoints."""
+        return [asdict(decision) for decision in self.decisions]
+
+    def restore(self, stored: Sequence[Mapping[str, Any]], where: str) -> None:
+        """Replace the decisions by those that `stored` returned; see `stored_decision`."""
+        self.decisions[:] = [stored_decision(values, where) for values in stored]
 
     def newest(self, name: str) -> Decision | None:
         """The newest decision on an effect; None if there is none yet."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from typing import Any
 
 from neilfpp_method.effects.catalogue import EFFECTS
-from neilfpp_method.effects.plan import Decision, Plan, stored_decision
+from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.types import NeilfConfig
@@ -45,7 +44,7 @@ def begin_plan(effects: str, settings: NeilfConfig) -> Plan:
 
 def stored_decisions(plan: Plan) -> dict[str, Any]:
     """The request and the decisions of a plan, as plain values for checkpoints."""
-    return {"request": str(plan.request), "decisions": [asdict(decision) for decision in plan.decisions]}
+    return {"request": str(plan.request), "decisions": plan.stored()}
 
 
 def restore_decisions(plan: Plan, stored: Mapping[str, Any]) -> None:
@@ -59,4 +58,4 @@ def restore_decisions(plan: Plan, stored: Mapping[str, Any]) -> None:
             f"{OPTION} is '{plan.request}', but the checkpoint was trained with '{stored['request']}'",
             f"continue with {OPTION} {stored['request']}, or start a new run",
         )
-    plan.decisions[:] = [stored_decision(values, "checkpoint") for values in stored["decisions"]]
+    plan.restore(stored["decisions"], "checkpoint")

@@ -11,7 +11,6 @@ The keys of the file are
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 from neilfpp_method.data.files.json_entry import write_json
@@ -30,10 +29,9 @@ FILE = "effects.json"
 
 def write_plan(run: Path, plan: Plan) -> None:
     """Write the decisions so far, and the table that follows from them, into the run folder."""
-    decisions = [dataclasses.asdict(decision) for decision in plan.decisions]
     write_json(
         run / FILE,
-        {"format": FORMAT, "request": str(plan.request), "decisions": decisions, "effects": rows(plan)},
+        {"format": FORMAT, "request": str(plan.request), "decisions": plan.stored(), "effects": rows(plan)},
     )
 
 
