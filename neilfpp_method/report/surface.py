@@ -6,14 +6,14 @@ import base64
 from dataclasses import dataclass
 from typing import Any
 
-import fast_simplification
 import numpy as np
 import torch
 import trimesh
 from jaxtyping import Float
 
 from neilfpp_method.export.asset.clean import clean
-from neilfpp_method.export.asset.surface import AssetSurface, creased, fine_surface
+from neilfpp_method.export.asset.simplify import decimated
+from neilfpp_method.export.asset.surface import AssetSurface, fine_surface
 from neilfpp_method.export.asset.visible import visible_faces
 from neilfpp_method.export.mesh import materials_in_parts
 from neilfpp_method.shading.color import tone_map
@@ -51,10 +51,7 @@ def packed_surface(run: Run) -> dict[str, Any]:
     cameras = [run.capture.scene_camera(view) for view in run.capture.train_views]
     surface = clean(full, visible_faces(full, cameras))
     if len(surface.faces) > FACES:
-        points, faces = fast_simplification.simplify(
-            surface.vertices.astype(np.float32), surface.faces.astype(np.int32), target_count=FACES
-        )
-        surface = creased(np.asarray(points, np.float64), np.asarray(faces))
+        surface = decimated(surface, FACES)
     corners = _corners(surface)
     low, high = corners.position.min(0), corners.position.max(0)
     extent = np.maximum(high - low, 1e-9)

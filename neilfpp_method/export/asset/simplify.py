@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import fast_simplification
@@ -9,10 +10,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, hits_along_normals
 
-__all__ = ["MAX_FACES", "MIN_FACES", "Distance", "Simplified", "distance_between", "simplified"]
+__all__ = ["MAX_FACES", "MIN_FACES", "Distance", "Simplified", "decimated", "distance_between", "simplified"]
 
 SAMPLES = 20_000
 """Number of points of each surface at which the distance to the other is measured."""
@@ -25,7 +27,9 @@ MAX_FACES = 200_000
 REACH = 0.1
 """Largest distance at which the other surface is searched along a normal, scene units."""
 NEIGHBORS = 16
-"""Number of triangles around a point among which a first bound of its distance is searched."""
+"""Number of triangles around a point among which one that faces the same way is sought first."""
+PAIRS_AT_ONCE = 200_000
+"""Number of pairs of points and triangles that are computed at once; it bounds memory."""
 WAYS = ((3.0, True), (4.0, True), (5.0, True), (7.0, False))
 """Aggressiveness of the decimation, and whether borders are kept; the first that reaches the number of
 triangles is used. From about 7 on, triangles of planes fold, and without borders whole strips are lost.
@@ -118,39 +122,57 @@ def _to_nearest(
     """Distances of points to the nearest triangle that faces the same way; infinite if there is none."""
     triangles, facing = surface.vertices[surface.faces], surface.mesh().face_normals
     center = triangles.mean(axis=1)
-    radius = np.linalg.norm(triangles - center[:, None], axis=-1).max()
-    tree = cKDTree(center)
-    distances = np.full(len(points), np.inf)
-    for row, (point, normal) in enumerate(zip(points, normals, strict=True)):
-        _, near = tree.query(point, min(NEIGHBORS, len(center)))
-        same = np.atleast_1d(near)[facing[near] @ normal > 0]
-        if not len(same):
-            same = np.flatnonzero(facing @ normal > 0)
-        if not len(same):
-            continue
-        # The nearest triangle is no farther than the nearest centre, and reaches `radius` around its own.
-        bound = np.linalg.norm(center[same] - point, axis=-1).min() + radius
-        within = np.array(tree.query_ball_point(point, bound * (1 + 1e-9)))
-        candidates = triangles[within[facing[within] @ normal > 0]]
-        nearest = trimesh.triangles.closest_point(candidates, np.tile(point, (len(candidates), 1)))
-        distances[row] = np.linalg.norm(nearest - point, axis=-1).min()
+    radius = np.linalg.norm(triangles - center[:, None], axis=-1).max(axis=1)
+    distances = _to_center(center, facing, points, normals)
+    rows = np.flatnonzero(np.isfinite(distances))
+    # The nearest triangle is no farther than the nearest centre, and reaches its radius around its own. Each
+    # size is searched for itself, because the radius of a large triangle would bring in many small ones.
+    size = np.frexp(radius)[1]
+    for faces in (np.flatnonzero(size == one) for one in np.unique(size)):
+        tree, reach = cKDTree(center[faces]), (distances + radius[faces].max()) * (1 + 1e-9)
+        pairs = np.cumsum(tree.query_ball_point(points[rows], reach[rows], return_length=True))
+        for some in np.split(rows, np.flatnonzero(np.diff(pairs // PAIRS_AT_ONCE)) + 1):
+            within = tree.query_ball_point(points[some], reach[some])
+            row = np.repeat(some, [len(near) for near in within])
+            face = faces[np.fromiter(itertools.chain.from_iterable(within), np.int64)]
+            same = (facing[face] * normals[row]).sum(-1) > 0
+            row, face = row[same], face[same]
+            nearest = trimesh.triangles.closest_point(triangles[face], points[row])
+            np.minimum.at(distances, row, np.linalg.norm(nearest - points[row], axis=-1))
     return distances
 
 
-def _with_faces(fine: AssetSurface, count: int) -> Simplified:
-    """A surface with `count` triangles or fewer, and its distance."""
-    mesh = fine.mesh() if count >= len(fine.faces) else _decimated(fine, count)
-    mesh.update_faces(mesh.nondegenerate_faces())
-    mesh.remove_unreferenced_vertices()
-    surface = creased(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces))
-    unchanged = count >= len(fine.faces)
-    distance = Distance(0.0, 0.0) if unchanged else distance_between(fine, surface)
-    return Simplified(surface, distance, distance)
+def _to_center(
+    center: Float[np.ndarray, "F 3"],
+    facing: Float[np.ndarray, "F 3"],
+    points: Float[np.ndarray, "N 3"],
+    normals: Float[np.ndarray, "N 3"],
+) -> Float[np.ndarray, " N"]:
+    """Distances of points to the nearest centre of a triangle that faces the same way; infinite if none does.
+
+    Args:
+        center: centres of the triangles.
+        facing: their unit normals.
+        points: the points.
+        normals: unit normals of the points.
+    """
+    distance, near = cKDTree(center).query(points, range(1, min(NEIGHBORS, len(center)) + 1))
+    same = np.einsum("nki,ni->nk", facing[near], normals) > 0
+    distances = np.where(same, distance, np.inf).min(1)
+    left, at_once = np.flatnonzero(np.isinf(distances)), max(1, PAIRS_AT_ONCE // len(center))
+    for some in np.split(left, range(at_once, len(left), at_once)):
+        same = normals[some] @ facing.T > 0
+        distances[some] = np.where(same, cdist(points[some], center), np.inf).min(1)
+    return distances
 
 
-def _decimated(fine: AssetSurface, count: int) -> trimesh.Trimesh:
-    """Decimate by quadric errors (Garland and Heckbert 1997)."""
-    for aggressiveness, keeps_borders in WAYS:
+def decimated(fine: AssetSurface, count: int) -> AssetSurface:
+    """Decimate by quadric errors (Garland and Heckbert 1997).
+
+    There are more than `count` triangles if even the most aggressive of `WAYS` leaves more.
+    """
+    mesh = fine.mesh()
+    for aggressiveness, keeps_borders in WAYS if count < len(fine.faces) else ():
         vertices, faces = fast_simplification.simplify(
             fine.vertices,
             fine.faces.astype(np.int32),
@@ -158,6 +180,16 @@ def _decimated(fine: AssetSurface, count: int) -> trimesh.Trimesh:
             agg=aggressiveness,
             preserve_border=keeps_borders,
         )
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
         if len(faces) <= count:
             break
-    return trimesh.Trimesh(vertices, faces, process=False)
+    mesh.update_faces(mesh.nondegenerate_faces())
+    mesh.remove_unreferenced_vertices()
+    return creased(np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces))
+
+
+def _with_faces(fine: AssetSurface, count: int) -> Simplified:
+    """A surface with `count` triangles or fewer, and its distance."""
+    surface = decimated(fine, count)
+    distance = Distance(0.0, 0.0) if count >= len(fine.faces) else distance_between(fine, surface)
+    return Simplified(surface, distance, distance)

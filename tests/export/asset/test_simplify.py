@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from neilfpp_method.export.asset import simplify
-from neilfpp_method.export.asset.simplify import Distance, distance_between, simplified
+from neilfpp_method.export.asset.simplify import Distance, _to_nearest, distance_between, simplified
 from neilfpp_method.export.asset.surface import AssetSurface, creased
 from tests.export.asset.tables import modelled, scanned
 
@@ -146,3 +146,31 @@ def test_a_part_that_faces_the_other_way_is_no_substitute():
     shape = trimesh.creation.box((1, 1, 0.02))
     plate = creased(np.array(shape.vertices, np.float64), np.array(shape.faces))
     assert distance_between(plate, plate.part(shape.face_normals[:, 2] < 0.5)).largest == np.inf
+
+
+def test_the_nearest_triangle_is_that_among_all_which_face_the_same_way(monkeypatch):
+    """Triangles of random sizes; the definition tests all pairs. Small parts are computed at once, and one
+    neighbour is often not enough.
+    """
+    monkeypatch.setattr(simplify, "PAIRS_AT_ONCE", 100)
+    monkeypatch.setattr(simplify, "NEIGHBORS", 2)
+    random = np.random.default_rng(0)
+    center, size = random.uniform(-1, 1, (60, 1, 3)), random.uniform(0.01, 0.8, (60, 1, 1))
+    corners = center + size * random.uniform(-1, 1, (60, 3, 3))
+    # No triangle faces down.
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    corners[normal[:, 2] < 0] = corners[normal[:, 2] < 0][:, ::-1]
+    surface = creased(corners.reshape(-1, 3), np.arange(180).reshape(-1, 3))
+    points, normals = random.uniform(-1.5, 1.5, (90, 3)), random.normal(size=(90, 3))
+    normals[:10] = 0, 0, -1
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+
+    expected = np.full(len(points), np.inf)
+    for row, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        same = corners[surface.mesh().face_normals @ normal > 0]
+        if len(same):
+            nearest = trimesh.triangles.closest_point(same, np.tile(point, (len(same), 1)))
+            expected[row] = np.linalg.norm(nearest - point, axis=1).min()
+    assert np.isinf(expected).sum() == 10
+    np.testing.assert_allclose(_to_nearest(surface, points, normals), expected, rtol=1e-9)
+    assert np.isinf(_to_nearest(surface, points[:10], normals[:10])).all()
