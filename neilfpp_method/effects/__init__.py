@@ -2,8 +2,8 @@
 
 `catalogue` lists the effects, each a change of settings. `request` parses the option `--effects`. `plan`
 records the decisions and derives the settings that follow from them. `review` runs the measurements at the
-moments of training when they are cheap; the folder `evidence` has one module for each. `table` formats a
-plan.
+moments of training when they are cheap; the folder `evidence` has one module for each. `following` passes
+the decisions on to the model, its light and the console. `table` formats a plan.
 
 Several measurements fit light and materials to places, which are in the folder `places`. The same fits give
 the initial light (`first_light`) and find paint that was taken for metal (`places.search`).

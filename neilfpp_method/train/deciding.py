@@ -10,19 +10,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects.first_light import start_with
+from neilfpp_method.effects import following
+from neilfpp_method.effects.following import Followers
 from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
     MIN_PIXELS,
-    improve_material,
     light_places,
     needs_surface,
-    record_lamps,
     review_light,
     review_material,
-    review_metals,
     review_surface,
 )
 from neilfpp_method.lighting.fit import Evidence
@@ -66,6 +64,11 @@ class Subject:
     say: Callable[[str], object]
     max_pixels: int = MAX_PIXELS
 
+    @property
+    def followers(self) -> Followers:
+        """What follows the decisions."""
+        return Followers(self.plan, self.model, self.light_solver, self.say)
+
 
 def review_before_material(subject: Subject, step: int) -> Evidence | None:
     """Take the measurements before a stage that trains material, and set the initial light.
@@ -85,7 +88,7 @@ def review_before_material(subject: Subject, step: int) -> Evidence | None:
 
 def follow_fit(subject: Subject, evidence: Evidence | None, step: int) -> None:
     """Record what a fit of the light after `step` steps has decided on lamps."""
-    follow(subject, record_lamps(subject.plan, evidence, subject.model.lamps.count, step))
+    following.follow_fit(subject.followers, evidence, step)
 
 
 def is_improvement_due(subject: Subject, position: StagePosition) -> bool:
@@ -107,24 +110,13 @@ def improve_half_trained(subject: Subject, position: StagePosition, step: int) -
     if not (model.brdf.metals or subject.plan.is_open("metals") or solver.scale_is_free):
         return
     seed_stream(subject.seed, Stream.SEARCH, step)
-    places, with_search = light_places(model, subject.pixels, subject.max_pixels), is_search_due(position)
-    improved = improve_material(model, solver, places, with_search)
-    if improved is None:
-        return
-    for summary in improved.summaries:
-        subject.say(summary)
-    if with_search:
-        follow(subject, review_metals(subject.plan, model, improved.lit, step))
+    places = light_places(model, subject.pixels, subject.max_pixels)
+    following.improve(subject.followers, places, is_search_due(position), step)
 
 
 def follow(subject: Subject, decisions: Sequence[Decision]) -> None:
     """Print decisions, and use the settings that follow from the plan."""
-    for decision in decisions:
-        subject.say(decision.summary())
-    if decisions:
-        config = subject.plan.config
-        subject.model.use(config)
-        subject.light_solver.use(config.light, subject.model.lobe)
+    following.follow(subject.followers, decisions)
 
 
 def _review(subject: Subject, step: int, review: Review, stream: Stream) -> None:
@@ -136,16 +128,9 @@ def _review(subject: Subject, step: int, review: Review, stream: Stream) -> None
 
 def _start_light(subject: Subject, step: int) -> Evidence | None:
     """Set the initial light, after the decisions on lobe and metals. Returns the evidence for lamps."""
-    model, solver = subject.model, subject.light_solver
-    if not solver.seeks_start:
+    if not subject.light_solver.seeks_start:
         return None
     subject.say("fitting light and material at selected places, to decide on effects …")
     seed_stream(subject.seed, Stream.LIGHT, step)
-    review = review_light(subject.plan, model, subject.pixels, step, subject.max_pixels)
-    follow(subject, review.decisions)
-    if review.first is None:
-        return None
-    subject.say(review.first.summary())
-    evidence = start_with(model, solver, review.first)
-    follow_fit(subject, evidence, step)
-    return evidence
+    review = review_light(subject.plan, subject.model, subject.pixels, step, subject.max_pixels)
+    return following.start_light(subject.followers, review, step)

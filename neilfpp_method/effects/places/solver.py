@@ -7,24 +7,18 @@ neighbours that other views showed, and neighbours together are a place.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import nn
 
-from neilfpp_method.effects.first_light import seconds_of_pixel, start_with
+from neilfpp_method.effects.first_light import seconds_of_pixel
+from neilfpp_method.effects.following import Followers, follow, follow_fit, improve, start_light
 from neilfpp_method.effects.places.gathering import MIN_COSINE, SAME_NORMAL, Places
 from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
-from neilfpp_method.effects.plan import Decision, Plan
-from neilfpp_method.effects.review import (
-    SURFACE_PIXELS,
-    improve_material,
-    record_lamps,
-    review_light_at,
-    review_metals,
-    review_visibility,
-)
+from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.review import SURFACE_PIXELS, review_light_at, review_visibility
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.ring import Ring
 from neilfpp_method.lighting.solver import LightSolver
@@ -89,20 +83,21 @@ class PlaceSolver(nn.Module):
             position: position of the step in its stage.
             step: index of the step in all stages.
         """
+        followers = Followers(self.plan, model, light_solver, self.say)
         # The fits need full precision, even within the autocast of the caller's loop.
         with torch.autocast(self.points.rows.device.type, enabled=False):
             if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
                 self._tried = True
-                self._start_light(model, light_solver, step)
+                self._start_light(followers, step)
             if is_comparison_due(model, position) and position.step != self._searched:
                 self._searched = position.step
-                self._improve(model, light_solver, is_search_due(position), step)
+                improve(followers, self.places(), is_search_due(position), step)
 
     def after_fit(
         self, model: NeilfModel, light_solver: LightSolver, evidence: Evidence | None, step: int
     ) -> None:
         """Record what a fit of the light has decided on lamps."""
-        self._follow(record_lamps(self.plan, evidence, model.lamps.count, step), model, light_solver)
+        follow_fit(Followers(self.plan, model, light_solver, self.say), evidence, step)
 
     @torch.no_grad()
     def places(self) -> Places:
@@ -120,41 +115,17 @@ class PlaceSolver(nn.Module):
         places = Places(len(center), place, fold, observed)
         return places.where(torch.nonzero(same)[:, 0]).with_at_least(MIN_PIXELS)
 
-    def _start_light(self, model: NeilfModel, light_solver: LightSolver, step: int) -> None:
+    def _start_light(self, followers: Followers, step: int) -> None:
         """Decide on effects, and set an initial light and material that explain the places.
 
         If there are too few places, no effect is decided, and the first fit starts from an even light.
         """
+        plan, model = followers.plan, followers.model
         surface = Observed.of_rows(self.points.kept()[:SURFACE_PIXELS])
-        self._follow(review_visibility(self.plan, model, surface, step), model, light_solver)
+        follow(followers, review_visibility(plan, model, surface, step))
         places = self.places()
         rate = seconds_of_pixel(
-            places.place.device,
-            with_lobe=self.plan.is_open("long-tails"),
-            with_metals=self.plan.is_open("metals"),
+            places.place.device, with_lobe=plan.is_open("long-tails"), with_metals=plan.is_open("metals")
         )
         self.say(f"the search for effects and an initial light takes about {rate * len(places.place):.0f} s")
-        review = review_light_at(places, self.plan, model, step)
-        self._follow(review.decisions, model, light_solver)
-        if review.first is not None:
-            self.say(review.first.summary())
-            self.after_fit(model, light_solver, start_with(model, light_solver, review.first), step)
-
-    def _improve(self, model: NeilfModel, light_solver: LightSolver, with_search: bool, step: int) -> None:
-        """Correct the scale of a half-trained model, and review metals (`review.improve_material`)."""
-        improved = improve_material(model, light_solver, self.places(), with_search)
-        if improved is None:
-            return
-        for summary in improved.summaries:
-            self.say(summary)
-        if with_search:
-            decisions = review_metals(self.plan, model, improved.lit, step)
-            self._follow(decisions, model, light_solver)
-
-    def _follow(self, decisions: Sequence[Decision], model: NeilfModel, light_solver: LightSolver) -> None:
-        """Print decisions, and use the settings that follow from the plan."""
-        for decision in decisions:
-            self.say(decision.summary())
-        if decisions:
-            model.use(self.plan.config)
-            light_solver.use(self.plan.config.light, model.lobe)
+        start_light(followers, review_light_at(places, plan, model, step), step)
