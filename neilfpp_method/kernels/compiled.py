@@ -1,4 +1,5 @@
-"""Loops for hash grids, sphere tracing and softplus on a CPU, compiled by Numba and cached on disk.
+"""Loops for hash grids, sphere tracing, sums of rows and softplus on a CPU, compiled by Numba and cached on
+disk.
 
 The loops release the global interpreter lock, start no threads, and add numbers in a fixed order. All of them
 are in this file because Numba compiles a function again only if the file of that function has changed; it
@@ -21,6 +22,7 @@ from numba.extending import intrinsic
 
 __all__ = [
     "add_to_table",
+    "add_weighted_rows",
     "interpolate",
     "point_gradient",
     "softplus",
@@ -272,6 +274,34 @@ def _at_vertices(grid, x, y, z, cells):
     far = grid[k + 1, j + 1, i] + x * (grid[k + 1, j + 1, i + 1] - grid[k + 1, j + 1, i])
     back = near + y * (far - near)
     return front + z * (back - front)
+
+
+# ----------------------------------------------------------------------------------------------- sums of rows
+
+
+@compiled
+def add_weighted_rows(matrix, weights, sums, start, stop):
+    """Add matrix[n, t] · weights[n, c] for the rows n in [start, stop) to sums[c, t], for three columns c.
+
+    Four rows are added at once, so that the sums are read and written a quarter as often.
+    """
+    red, green, blue = sums[0], sums[1], sums[2]
+    fours = start + (stop - start) // 4 * 4
+    for n in range(start, fours, 4):
+        a, b, c, d = matrix[n], matrix[n + 1], matrix[n + 2], matrix[n + 3]
+        r0, r1, r2, r3 = weights[n, 0], weights[n + 1, 0], weights[n + 2, 0], weights[n + 3, 0]
+        g0, g1, g2, g3 = weights[n, 1], weights[n + 1, 1], weights[n + 2, 1], weights[n + 3, 1]
+        b0, b1, b2, b3 = weights[n, 2], weights[n + 1, 2], weights[n + 2, 2], weights[n + 3, 2]
+        for t in range(len(a)):
+            red[t] += a[t] * r0 + b[t] * r1 + c[t] * r2 + d[t] * r3
+            green[t] += a[t] * g0 + b[t] * g1 + c[t] * g2 + d[t] * g3
+            blue[t] += a[t] * b0 + b[t] * b1 + c[t] * b2 + d[t] * b3
+    for n in range(fours, stop):
+        row, r, g, v = matrix[n], weights[n, 0], weights[n, 1], weights[n, 2]
+        for t in range(len(row)):
+            red[t] += row[t] * r
+            green[t] += row[t] * g
+            blue[t] += row[t] * v
 
 
 # ------------------------------------------------------------------------------ softplus, computed in float32

@@ -17,6 +17,7 @@ from torch import Tensor
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
+from neilfpp_method.kernels.products import times_channels
 from neilfpp_method.lighting.lamp_transport import in_sight, lamp_kernel
 from neilfpp_method.lighting.map_transport import TexelRays, trace_texels
 from neilfpp_method.lighting.transport import Transport, brdf_kernel, spans
@@ -98,7 +99,7 @@ def light_layers(
     environment, lamps = light.light, light.lamps
     radiance = environment.log_radiance.exp().flatten(1).t()
     spans_of_pixels = [
-        LightLayers(part.sources.float() @ radiance, part.scene)
+        LightLayers(times_channels(part.sources.float(), radiance), part.scene)
         for part in _texel_layers(environment, shared, roughnesses, lobe, scene)
     ]
     from_light = torch.cat([layers.light for layers in spans_of_pixels], 1)

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from neilfpp_method.kernels.products import times_channels
 from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
 from neilfpp_method.structures import Material, Observed
 
@@ -72,11 +73,11 @@ class Transport:
 
     def with_strength(self, strength: Float[Tensor, "T 3"]) -> Transport:
         """A transport without sources, whose `scene` includes these sources at a known strength."""
-        return Transport(self.sources[..., :0], self.scene + self.sources @ strength)
+        return Transport(self.sources[..., :0], self.scene + times_channels(self.sources, strength))
 
     def outgoing(self, material: Material, strength: Float[Tensor, "T 3"]) -> Float[Tensor, "N 3"]:
         """L_o for sources of this strength; see `outgoing_radiance`."""
-        return outgoing_radiance(_SumOverSources.apply(self.sources, strength) + self.scene, material)
+        return outgoing_radiance(times_channels(self.sources, strength) + self.scene, material)
 
 
 def outgoing_radiance(parts: Float[Tensor, "K N 3"], material: Material) -> Float[Tensor, "N 3"]:
@@ -90,30 +91,6 @@ def outgoing_radiance(parts: Float[Tensor, "K N 3"], material: Material) -> Floa
         facing, grazing = reflected
         color = color + normal_reflectance(material) * facing + grazing
     return color
-
-
-class _SumOverSources(torch.autograd.Function):
-    """sources @ strength: (K, N, T) @ (T, 3) → (K, N, 3).
-
-    The backward pass of autograd for `strength` multiplies by the transposed sources, which it does not read
-    in the order of memory. The pass below reads them in order, which is faster; a fit spends most of its time
-    here.
-    """
-
-    @staticmethod
-    def forward(ctx, sources: Tensor, strength: Tensor) -> Tensor:
-        ctx.save_for_backward(sources, strength)
-        return sources @ strength
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        sources, strength = ctx.saved_tensors
-        grad_sources = grad_strength = None
-        if ctx.needs_input_grad[0]:
-            grad_sources = grad @ strength.t()
-        if ctx.needs_input_grad[1]:
-            grad_strength = (grad.flatten(0, 1).t() @ sources.flatten(0, 1)).t()
-        return grad_sources, grad_strength
 
 
 def brdf_kernel(

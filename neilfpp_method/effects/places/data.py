@@ -5,7 +5,6 @@ Because there are few places, the transport is stored as a matrix for each rough
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
 import torch
@@ -61,9 +60,10 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
     """
     environment = EnvironmentLight(ROWS, 1.0).to(places.place.device)
     shared = places.shared_points()
-    drawn = [texel_layers(environment, shared, ROUGHNESSES, lobe, scene) for _ in range(DIRECTIONS)]
-    sources, scene_light = (
-        functools.reduce(torch.add, (getattr(part, name) / DIRECTIONS for part in drawn))
-        for name in ("sources", "scene")
-    )
-    return Transport(sources, scene_light)
+    drawn = (texel_layers(environment, shared, ROUGHNESSES, lobe, scene) for _ in range(DIRECTIONS))
+    total = next(drawn)
+    for part in drawn:
+        # In place: a matrix may have hundreds of megabytes.
+        total.sources.add_(part.sources)
+        total.scene.add_(part.scene)
+    return Transport(total.sources.div_(DIRECTIONS), total.scene.div_(DIRECTIONS))

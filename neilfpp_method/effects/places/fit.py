@@ -26,6 +26,7 @@ from neilfpp_method.effects.places.grid import (
     on_grid,
     relative_error,
 )
+from neilfpp_method.kernels.products import times_channels
 from neilfpp_method.lighting.layered_transport import layers_at
 from neilfpp_method.lighting.objective import OUTLIER_ERROR, total_variation, white_balance
 from neilfpp_method.lighting.transport import Transport
@@ -131,7 +132,7 @@ def fit_places(
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS
         fit = _better_light(fit, data, permitted, steps)
-        from_map = [part.float() @ fit.radiance for part in data.transport.sources]
+        from_map = [times_channels(part.float(), fit.radiance) for part in data.transport.sources]
         parts = torch.stack(from_map) + data.transport.scene
         best = best_materials(parts, places, data.typical, metallics, near)
         fit = PlaceFit(fit.log_radiance, best.base_color, best.roughness, best.metallic)
@@ -211,10 +212,11 @@ def seconds_of_step(pixels: int, device: torch.device) -> float:
     Most of a step is the multiplication of the transport matrix and of its transpose, which is timed.
     """
     transport = torch.ones(3 * pixels, 2 * ROWS**2, device=device)
-    light = torch.ones(2 * ROWS**2, 3, device=device)
+    light = torch.ones(2 * ROWS**2, 3, device=device, requires_grad=True)
     began = time.perf_counter()
-    for _ in range(TIMED_STEPS):
-        back = transport.T @ (transport @ light)
+    with torch.enable_grad():
+        for _ in range(TIMED_STEPS):
+            times_channels(transport, light).sum().backward()
     # `item` waits for the device.
-    back.sum().item()
+    light.grad.sum().item()
     return (time.perf_counter() - began) / TIMED_STEPS

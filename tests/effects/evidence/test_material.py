@@ -30,9 +30,10 @@ def ball_of(
     lobe: Lobe | None = LOBE,
     environment: EnvironmentLight | None = None,
     brightness: float = 1.0,
+    count: int = PLACES,
 ) -> Places:
-    """A ball of one material."""
-    one, color = torch.ones(PLACES, 1), brightness * torch.tensor([[0.6, 0.5, 0.4]]).expand(PLACES, 3)
+    """A ball of one material, with `count` places."""
+    one, color = torch.ones(count, 1), brightness * torch.tensor([[0.6, 0.5, 0.4]]).expand(count, 3)
     return ball(color, 0.28 * one, metallic * one, lobe, VIEWS, environment)
 
 
@@ -75,7 +76,7 @@ def test_colours_of_the_light_are_distinguished_from_paint():
     window = sky()
     window.log_radiance[1:, ROWS // 4 : 3 * ROWS // 8, 10:14] -= 2.0
     window.log_radiance[0, : ROWS // 2] -= 1.0
-    found = judged(ball_of(0.0, LOBE, window), "coloured-light")["coloured-light"]
+    found = judged(ball_of(0.0, LOBE, window, count=4 * PLACES), "coloured-light")["coloured-light"]
     assert found.value > 3 * found.deviation
 
 
