@@ -49,13 +49,9 @@ LAMP_PIXELS = 4096
 """
 CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
-LOBE_FITS = 3.9
-"""Time of the evidence for the lobe in units of a fit to all pixels: four pairs of fits to three quarters of
-them, each with half the usual number of rounds, and a short fit for their scale.
-"""
-METAL_FITS = 4.1
-"""Time of the evidence for metals in units of a fit to all pixels: four pairs of fits to four fifths of them,
-each with half the usual number of rounds.
+ALTERNATIVE_FITS = 1.8
+"""Time of one alternative of `evidence.alternatives` in units of a fit to all pixels: four fits to three
+quarters of them, each with half the usual number of rounds.
 """
 TIMED_PIXELS = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
@@ -159,7 +155,10 @@ def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -
     carried = CARRIED_ROUNDS * STEPS
     # One fit per scale, two fits with and without lamps, and the final fit to all views.
     steps = (1 - 1 / FOLDS) * (whole + (len(SCALES) + 1) * carried) + carried
-    steps += (LOBE_FITS * with_lobe + METAL_FITS * with_metals) * whole
+    # Two lobes, and metal and paint. If both are compared, one alternative is common to them. A short fit
+    # finds their scale.
+    alternatives = {(False, False): 0, (True, True): 3}.get((with_lobe, with_metals), 2)
+    steps += alternatives * ALTERNATIVE_FITS * whole + (FIRST_STEPS if alternatives else 0)
     return (1 + OVERHEAD_SHARE) * steps * seconds_of_step(TIMED_PIXELS, device) / TIMED_PIXELS
 
 

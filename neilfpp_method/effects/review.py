@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.evidence.alternatives import Alternatives
 from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.evidence.exposure import Exposures
 from neilfpp_method.effects.evidence.lobes import lobe_evidence
@@ -20,7 +21,6 @@ from neilfpp_method.effects.evidence.poses import pose_evidence
 from neilfpp_method.effects.evidence.visibility import self_visibility
 from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_first_light
 from neilfpp_method.effects.measurement import Measurement
-from neilfpp_method.effects.places.data import PlaceData, place_transport
 from neilfpp_method.effects.places.gathering import Places, gather_places
 from neilfpp_method.effects.places.lit import LitPlaces, light_up
 from neilfpp_method.effects.places.rescaling import correct_scale
@@ -154,19 +154,18 @@ def review_light_at(places: Places, plan: Plan, model: NeilfModel, step: int) ->
     """`review_light` at given places, with the model in evaluation mode."""
     if places.shown_count < MIN_PLACES:
         return _without_light(plan, step, f"fewer than {MIN_PLACES} places are shown by {MIN_VIEWS} views")
-    facts, decisions, first = model.facts, [], None
+    alternatives, decisions, first = Alternatives(places, model.scene, model.facts), [], None
     if plan.is_open("long-tails") and plan.newest("long-tails") is None:
-        measured = lobe_evidence(places, model.scene, facts, model.brdf.metals)
+        measured = lobe_evidence(alternatives, model.brdf.metals)
         decisions.append(plan.decide("long-tails", measured, step))
         model.use(plan.config)
     if model.lobe is not None:
-        transport = place_transport(places, model.lobe, model.scene)
-        data = PlaceData(places, transport, facts.median_radiance, facts.response)
+        lobe = model.config.shading.lobe
         if plan.is_open("metals") and model.brdf.metals:
-            measured = metals_evidence(data)
+            measured = metals_evidence(alternatives, lobe)
             decisions.append(plan.decide("metals", measured, step))
             model.use(plan.config)
-        first = find_first_light(data, model.brdf.metals)
+        first = find_first_light(alternatives.data(lobe), model.brdf.metals)
     return LightReview(decisions, first)
 
 

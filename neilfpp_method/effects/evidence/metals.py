@@ -25,9 +25,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from neilfpp_method.effects.evidence.alternatives import Alternative, reduction_in_held_back_views
+from neilfpp_method.effects.evidence.alternatives import Alternatives, reduction
 from neilfpp_method.effects.measurement import Measurement, mean_reduction
-from neilfpp_method.effects.places.data import PlaceData
 from neilfpp_method.effects.places.grid import BestMaterials
 from neilfpp_method.effects.places.lit import METAL, PAINT, LitPlaces
 from neilfpp_method.effects.places.search import SearchedMaterial, found_in
@@ -35,12 +34,8 @@ from neilfpp_method.fields.brdf import BrdfField
 
 __all__ = ["find_metal", "metals_evidence", "metals_evidence_in"]
 
-FOLDS = 5
-"""Number of folds of the views; one fold is held back at a time."""
-TURNS = 4
-"""Number of folds that are held back in turn. With only one, the standard error would be as large as the
-increase of the error that metals cause in a scene without metal.
-"""
+FOLDS_UNDER_LIGHT = 5
+"""Number of folds of the views under the trained light; every fold is held back in turn."""
 THRESHOLD = 0.0
 """Threshold for the reduction of the relative error. Metals take no additional time, so they are left out
 only if they increase the error.
@@ -61,17 +56,23 @@ and 28 %.
 """
 
 
-def metals_evidence(data: PlaceData) -> Measurement:
-    """Mean reduction of the relative error of the places by metals, in held-back views."""
-    paint, metal = Alternative(data, metals=False), Alternative(data, metals=True)
-    threshold = THRESHOLD_IN_DISPLAY_VALUES if data.response == "srgb" else THRESHOLD
-    return reduction_in_held_back_views(paint, metal, FOLDS, TURNS, "metals", threshold)
+def metals_evidence(alternatives: Alternatives, lobe: str) -> Measurement:
+    """Mean reduction of the relative error of the places by metals, in held-back views.
+
+    Args:
+        alternatives: the ways to explain the places.
+        lobe: the lobe of highlights that the model uses.
+    """
+    paint, metal = (alternatives.errors(lobe, metals) for metals in (False, True))
+    display_values = alternatives.facts.response == "srgb"
+    threshold = THRESHOLD_IN_DISPLAY_VALUES if display_values else THRESHOLD
+    return reduction(paint, metal, "metals", threshold)
 
 
 @torch.no_grad()
 def metals_evidence_in(lit: LitPlaces, response: str) -> Measurement:
     """The same as `metals_evidence`, under a fixed light."""
-    reductions = (_reduction_in_held_back_views(lit, turn) for turn in range(FOLDS))
+    reductions = (_reduction_in_held_back_views(lit, turn) for turn in range(FOLDS_UNDER_LIGHT))
     what = "reduction of the error in held-back views by metals, under the trained light"
     threshold = THRESHOLD_IN_DISPLAY_VALUES if response == "srgb" else THRESHOLD_UNDER_LIGHT
     return mean_reduction(reductions, what, threshold)
@@ -79,7 +80,7 @@ def metals_evidence_in(lit: LitPlaces, response: str) -> Measurement:
 
 def _reduction_in_held_back_views(lit: LitPlaces, turn: int) -> Float[Tensor, " P"]:
     """The error of each place with the best paint, minus that with metal where it is clearly better."""
-    split = lit.hold_back(turn, FOLDS)
+    split = lit.hold_back(turn, FOLDS_UNDER_LIGHT)
     paint, metal = split.known.best(PAINT), split.known.best(METAL)
     best = metal.where(_is_metal(paint, metal), paint)
     return split.held_back.mean_errors(paint.material) - split.held_back.mean_errors(best.material)
