@@ -62,6 +62,8 @@ def stored_decision(values: Mapping[str, Any], where: str) -> Decision:
     try:
         evidence = values["evidence"]
         decision = from_dict(Decision, {key: v for key, v in values.items() if key != "evidence"}, where)
+        if evidence is not None:
+            decision = replace(decision, evidence=from_dict(Measurement, evidence, where))
     except (TypeError, AttributeError, KeyError) as error:
         # A key is missing, or a value is not an object.
         raise UserError(
@@ -71,9 +73,7 @@ def stored_decision(values: Mapping[str, Any], where: str) -> Decision:
         raise UserError(
             f"{where}: no effect '{decision.effect}'", "use the version of neilfpp that wrote the run"
         )
-    if evidence is None:
-        return decision
-    return replace(decision, evidence=from_dict(Measurement, evidence, where))
+    return decision
 
 
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:

@@ -14,7 +14,7 @@ from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shadin
 from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES
 from neilfpp_method.effects.evidence.visibility import self_visibility
 from neilfpp_method.effects.measurement import Measurement, mean_of
-from neilfpp_method.effects.plan import Plan
+from neilfpp_method.effects.plan import Plan, stored_decision
 from neilfpp_method.effects.request import check_effects, parse_effects
 from neilfpp_method.effects.review import _rendered_surface, record_lamps, review_surface
 from neilfpp_method.errors import UserError
@@ -292,3 +292,11 @@ def test_metals_have_to_be_earned(value, on):
     gain = Measurement("error", value, 0.0003, 0.0, 400)
     assert plan.decide("metals", gain, 5).on is on
     assert plan.decide("long-tails", gain, 5).on, "it stays on unless it is significantly worse"
+
+
+@pytest.mark.parametrize("evidence", [True, 3, [], {}, {"what": "gain"}])
+def test_evidence_of_another_form_is_refused_in_one_line(evidence):
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
+    decision = plan.decide("metals", Measurement("gain", 1.0, 0.1, 0.0, 100), 0)
+    with pytest.raises(UserError, match=r"run/effects\.json: not a complete record"):
+        stored_decision({**dataclasses.asdict(decision), "evidence": evidence}, "run/effects.json")
