@@ -49,6 +49,17 @@ def smooth_normals(
         radius: radius of the neighbourhood, scene units. Relief that is finer than this and flatter than
             about 10° is lost.
     """
+    # Half precision is too coarse for the fit of a plane to normals.
+    with torch.autocast(position.device.type, enabled=False):
+        return _smoothed(gradient, position, normal, radius)
+
+
+def _smoothed(
+    gradient: Callable[[Float[Tensor, "P 3"]], Float[Tensor, "P 3"]],
+    position: Float[Tensor, "N 3"],
+    normal: Float[Tensor, "N 3"],
+    radius: float,
+) -> Float[Tensor, "N 3"]:
     ring = _rings(position)
     around = position[:, None] + radius * (ring @ local_frame(normal)[:, :2])
     normals = torch.cat((normal[:, None], safe_normalize(gradient(around.flatten(0, 1))).view_as(around)), 1)

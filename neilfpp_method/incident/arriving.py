@@ -85,4 +85,5 @@ def _behind_scene(
     """The scene's radiance where a direction hits it, else the light's, which is only evaluated there."""
     point, direction = torch.nonzero(~scene.hit, as_tuple=True)
     beyond = light.radiance(x[point], wi[point, direction][:, None])[:, 0]
-    return scene.radiance.index_put((point, direction), beyond)
+    # Within autocast a light field returns half precision.
+    return scene.radiance.index_put((point, direction), beyond.to(scene.radiance.dtype))

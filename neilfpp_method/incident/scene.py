@@ -53,7 +53,9 @@ def scene_light(
     """
     x = x.detach()
     if isinstance(host, TracesLight):
-        return host.scene_light(x, wi)
+        # Half precision is too coarse for the hits, and hosts collect their radiance in float32.
+        with torch.autocast(x.device.type, enabled=False):
+            return host.scene_light(x, wi)
     points = x[:, None].expand_as(wi).reshape(-1, 3)
     radiance, distance = [], []
     for point, direction in zip(

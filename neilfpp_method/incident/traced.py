@@ -97,4 +97,5 @@ def _cone_directions(normal: Float[Tensor, "K 3"], min_cosine: float) -> Float[T
     cosine = min_cosine + (1.0 - min_cosine) * torch.rand_like(normal[:, :1])
     sine = (1.0 - cosine.square()).clamp_min(0.0).sqrt()
     local = torch.cat([sine * azimuth.cos(), sine * azimuth.sin(), cosine], dim=-1)
-    return (local[:, None] @ local_frame(normal))[:, 0]
+    # Not a matmul, which autocast would do in half precision.
+    return (local[:, :, None] * local_frame(normal)).sum(1)

@@ -70,15 +70,17 @@ class KnownBall:
         environment: the map (H, W, 3), linear radiance.
         base_color: unit normals (N, 3) to base colour (N, 3).
         roughness, metallic: the same at every point.
+        lobe: "ggx" or "spherical_gaussian".
     """
 
     environment: Array = field(default_factory=sky)
     base_color: Callable[[Array], Array] = lambda n: 0.5 + 0.3 * n
     roughness: float = 0.35
     metallic: float = 0.0
+    lobe: str = "ggx"
 
     def outgoing(self, n: Array, wo: Array, by_lobe: bool = True) -> Array:
-        """Linear radiance (N, 3) towards unit `wo`: the rendering equation with the GGX lobe.
+        """Linear radiance (N, 3) towards unit `wo`: the rendering equation with the lobe of the ball.
 
         Args:
             n, wo: unit normals and directions to the viewer, (N, 3).
@@ -93,17 +95,24 @@ class KnownBall:
         if by_lobe:
             return result + self._specular_by_lobe(n, wo, b, r, m)
         for rows in np.array_split(np.arange(len(n)), max(1, len(n) // 64)):
-            _, specular = oracles.brdf("ggx", b[rows], r, m, n[rows, None], wo[rows, None], wi[None])
+            _, specular = oracles.brdf(self.lobe, b[rows], r, m, n[rows, None], wo[rows, None], wi[None])
             cosine = np.maximum(n[rows] @ wi.T, 0)
             result[rows] += np.einsum("nkc,nk,kc->nc", specular, cosine, light)
         return result
 
     def _specular_by_lobe(self, n: Array, wo: Array, b: Array, r: Array, m: Array) -> Array:
-        """∫ f_s L cos dwi as the mean of F G (wo·h)/((n·wo)(n·h)) L over half vectors of density D (n·h)."""
+        """∫ f_s L cos dwi as the mean of F G (wo·h)/(n·wo) D/p L over half vectors h of density p."""
         rng = np.random.default_rng(0)
         k = np.arange(SPECULAR_DIRECTIONS)
         u = (k + 0.5) / SPECULAR_DIRECTIONS
-        cosine = np.sqrt((1 - u) / (1 + (r**4 - 1) * u))
+        if self.lobe == "ggx":
+            # p = D (n·h)
+            cosine = np.sqrt((1 - u) / (1 + (r**4 - 1) * u))
+            ratio = 1 / cosine
+        else:
+            # p = D / (1 − e^(−2/r⁴))
+            cosine = 1 + r**4 / 2 * np.log1p(u * np.expm1(-2 / r**4))
+            ratio = np.full_like(cosine, -np.expm1(-2 / r**4))
         azimuth = k * np.pi * (3 - np.sqrt(5)) + 2 * np.pi * rng.random((len(n), 1))
         local = oracles.spherical(cosine[None], azimuth)
         aside = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
@@ -113,14 +122,12 @@ class KnownBall:
         h = local @ frame
         towards = (h * wo[:, None]).sum(-1, keepdims=True)
         wi = 2 * towards * h - wo[:, None]
-        cos_i, cos_o, cos_h = (
-            (v * n[:, None]).sum(-1, keepdims=True) for v in (wi, np.broadcast_to(wo[:, None], wi.shape), h)
-        )
+        cos_i, cos_o = ((v * n[:, None]).sum(-1, keepdims=True) for v in (wi, wo[:, None]))
         valid = (cos_i > 0) & (towards > 0)
         f0 = 0.04 * (1 - m) + b * m
         fresnel = f0 + (1 - f0) * (1 - towards.clip(0, 1)) ** 5
-        masking = oracles.masking("ggx", np.where(valid, cos_i, 1.0), cos_o, r)
-        weight = np.where(valid, fresnel * masking * towards / (cos_o * cos_h), 0.0)
+        masking = oracles.masking(self.lobe, np.where(valid, cos_i, 1.0), cos_o, r)
+        weight = np.where(valid, fresnel * masking * towards / cos_o * ratio[:, None], 0.0)
         return (weight * radiance_from(self.environment, wi)).mean(1)
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import trimesh
 
 from neilfpp_method.data.files.images import write_exr, write_png
 from tests.data.make_capture import srgb
@@ -64,6 +65,7 @@ def write_capture(
     hdr: bool = True,
     inside: bool = False,
     cloud: Seen | None = None,
+    mesh: trimesh.Trimesh | None = None,
     masks: bool = True,
     gains: Array | None = None,
     unit: float = 1.0,
@@ -79,6 +81,7 @@ def write_capture(
         hdr: linear EXR, or PNG with 8-bit sRGB values.
         inside: the cameras stand near the origin and look away from it, with a field of view of 90°.
         cloud: the point cloud of the capture, if it has one.
+        mesh: the mesh of the capture, if it has one, scene frame.
         gains: factor on the radiance of each view, (V,); if None, all are 1.
         unit: length of a scene unit in the world.
         away: the centre of the scene in the world, scene units.
@@ -124,6 +127,10 @@ def write_capture(
     }
     if cloud is not None:
         write_cloud(inputs / "model" / "oriented_pcd.ply", unit * (cloud.position + away), cloud)
+    if mesh is not None:
+        corners = trimesh.Trimesh(unit * (mesh.vertices + away), mesh.faces, process=False)
+        (inputs / "model").mkdir(exist_ok=True)
+        corners.export(inputs / "model" / "mesh.ply")
     (inputs / "sfm_scene.json").write_text(json.dumps(scene))
     (root / "split.json").write_text(json.dumps({"test": [0]}))
     return root
