@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from neilfpp_method.data.cameras.neighbors import choose_sources
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.data.point_cloud import WorldPoints
 from neilfpp_method.errors import UserError
 from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps
-from neilfpp_method.prepare.plane_sweep import choose_sources, gray_view, inverse_depth_step, sweep
+from neilfpp_method.prepare.plane_sweep import gray_view, inverse_depth_step, sweep
 from neilfpp_method.prepare.progress import Bars
 from neilfpp_method.prepare.sparse_cloud import without_outliers
 

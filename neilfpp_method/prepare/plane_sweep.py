@@ -9,39 +9,21 @@ Approach to True Multi-Image Matching, CVPR 1996). OpenCV does the warping and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32, Float64
 
-from neilfpp_method.data.cameras.camera import Camera, scaled_camera
-from neilfpp_method.data.cameras.undistort import resample, straight_camera
+from neilfpp_method.data.cameras.camera import Camera
 from neilfpp_method.data.files.images import read_image
+from neilfpp_method.data.pixels.gray import GrayView, gray_of
 from neilfpp_method.data.views import Normalization, View
-from neilfpp_method.shading.color import luminance
 
-__all__ = ["GrayView", "choose_sources", "gray_view", "inverse_depth_step", "sweep"]
-
-MAX_SIDE = 640
-"""Longest side of the compared images, in pixels; a larger image is scaled down. Time and memory grow with
-the third power of it, because the number of planes grows as well."""
+__all__ = ["gray_view", "inverse_depth_step", "sweep"]
 
 WINDOW = 7
 """Side of the square correlation window, in pixels. A larger window is less sensitive to noise, but it blurs
 depth at the edges of objects."""
-
-BEST_ANGLE = 12.0
-"""Preferred angle between the directions in which two cameras see the scene's centre, in degrees: wide enough
-to measure depth, narrow enough that both images look alike."""
-
-MIN_ANGLE = 3.0
-"""Smallest angle between two cameras, in degrees. Below it, a pixel of disparity is a large step in depth."""
-
-MAX_ANGLE = 35.0
-"""Largest angle between two cameras, in degrees. Above it, perspective and occlusion change the images too
-much for a correlation of windows."""
 
 MIN_PLANES = 32
 """Smallest number of planes, so that the parabola through three neighbouring scores is meaningful even if the
@@ -66,67 +48,17 @@ MIN_DEPTH_RATIO = 0.05
 inside or close to the scene's sphere, for which the range would otherwise begin at or behind the camera."""
 
 
-@dataclass(frozen=True)
-class GrayView:
-    """The image of a view as stereo compares it.
-
-    Attributes:
-        camera: a pinhole of at most `MAX_SIDE` pixels a side.
-        gray: grey values in [0, 1], of the camera's size.
-    """
-
-    camera: Camera
-    gray: Float32[np.ndarray, "H W"]
-
-
 def gray_view(view: View, linear: bool) -> GrayView:
     """Read the image of a view for stereo: grey, without lens distortion, at most `MAX_SIDE` pixels a side.
 
-    Exposure and white balance are not corrected, because the correlation of two windows does not depend on
-    brightness and contrast.
-
     Args:
         view: a view of a capture.
-        linear: whether pixels are linear radiance. If so, the square root of luminance is used, which makes
-            the noise of dark and bright pixels similar.
+        linear: whether pixels are linear radiance.
     """
     image = read_image(view.image).pixels
     usable = np.where(np.isfinite(image) & (image > 0), image, np.float32(0))
     color = np.broadcast_to(usable, (*image.shape[:2], 3)).copy()
-    camera = straight_camera(view.camera)
-    if camera is not view.camera:
-        color = resample(color, view.camera, camera)
-    gray = luminance(torch.from_numpy(color)).numpy()
-    gray = np.sqrt(gray / max(float(np.quantile(gray, 0.99)), 1e-9)).clip(0.0, 1.0) if linear else gray
-    scale = min(1.0, MAX_SIDE / max(camera.width, camera.height))
-    width, height = round(camera.width * scale), round(camera.height * scale)
-    if (width, height) != (camera.width, camera.height):
-        gray = cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA)
-        camera = scaled_camera(camera, width, height)
-    return GrayView(camera, np.ascontiguousarray(gray, np.float32))
-
-
-def choose_sources(
-    cameras: Sequence[Camera], center: Float64[np.ndarray, " 3"], count: int
-) -> list[list[int]]:
-    """Choose the source views of each view by the angle between the two cameras as seen from `center`.
-
-    Args:
-        cameras: the cameras of all views, in the world frame.
-        center: centre of the scene, in the world frame.
-        count: largest number of sources per view.
-
-    Returns:
-        For each camera the indices of its sources, best first: the angles between `MIN_ANGLE` and `MAX_ANGLE`
-        whose ratio to `BEST_ANGLE` is closest to 1. The list of a camera may be empty.
-    """
-    eyes = np.stack([camera.c2w[:, 3] for camera in cameras])
-    directions = (eyes - center) / np.linalg.norm(eyes - center, axis=1, keepdims=True)
-    angles = np.degrees(np.arccos(np.clip(directions @ directions.T, -1.0, 1.0)))
-    cost = np.abs(np.log(np.maximum(angles, 1e-3) / BEST_ANGLE))
-    cost[(angles < MIN_ANGLE) | (angles > MAX_ANGLE)] = np.inf
-    order = np.argsort(cost, axis=1)[:, :count]
-    return [[int(j) for j in row if np.isfinite(cost[i, j])] for i, row in enumerate(order)]
+    return gray_of(color, view.camera, linear)
 
 
 def inverse_depth_step(camera: Camera, sources: Sequence[Camera]) -> float:

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from neilfpp_method.data.cameras.camera import Camera
+from neilfpp_method.data.cameras.neighbors import choose_sources
+from neilfpp_method.data.pixels.gray import GrayView
 from neilfpp_method.data.views import Normalization
 from neilfpp_method.prepare.depth_fusion import DepthMap, fuse_depth_maps
 from neilfpp_method.prepare.depth_planes import fit_planes
-from neilfpp_method.prepare.plane_sweep import GrayView, choose_sources, inverse_depth_step, sweep
+from neilfpp_method.prepare.plane_sweep import inverse_depth_step, sweep
 from tests.prepare.textured_corner import FOCAL, photograph, pose
 
 SIZE = (240, 180)
