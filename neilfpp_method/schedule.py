@@ -5,8 +5,8 @@
     material init    x     -     -     -      -      -     x      x      x   | B, L
     joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
 
-"low" means a lower weight than in SDF init. If photographs have gains of their own, the prior on the gains is
-active whenever L_vol is.
+"low" means a lower weight than in SDF init. Presets made for photographs add L_patch in SDF init. If
+photographs have gains of their own, the prior on the gains is active whenever L_vol is.
 
 Two more tables are for hosts whose geometry is not trained here. With given geometry (`FIXED_GEOMETRY`), R is
 a surface light field and is trained together with the material. For a host that belongs to another trainer
@@ -108,6 +108,7 @@ STAGES: StageTable = {
             "hessian": "hessian",
             "surface": "surface",
             "point_cloud": "point_cloud",
+            "patches": "patches",
         },
         trains=GEOMETRY,
         grows={"hessian": "hessian_growth"},

@@ -14,6 +14,7 @@ from neilfpp_method import losses
 from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.base import RegularizedHits
 from neilfpp_method.hosts.camera_places import check_cameras
+from neilfpp_method.hosts.patches import PatchViews, patch_loss
 from neilfpp_method.hosts.radiance import background_field, radiance_field
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.facts import SceneFacts
@@ -24,7 +25,7 @@ from neilfpp_method.timing.ledger import timed
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
 from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
-from neilfpp_method.volume.empty_space import EmptySpace
+from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples, sample_counts
@@ -65,17 +66,6 @@ class RegularizerInputs:
     hessian_points: Float[Tensor, "C 3"]
 
 
-@dataclass(frozen=True)
-class EvaluationSpace:
-    """Empty space of a G that is not being trained, and the versions of the parameters that G had then.
-
-    The versions show that weights were loaded. They do not show every training step (`VolSdfHost._march`).
-    """
-
-    versions: list[tuple[int, int]]
-    space: EmptySpace
-
-
 class VolSdfHost(nn.Module):
     """G and R, rendered as a volume with the Laplace density of G.
 
@@ -88,6 +78,7 @@ class VolSdfHost(nn.Module):
 
     Attributes:
         starts_from_shape: whether G has been fitted to a known shape (`train.start`); in checkpoints.
+        patch_views: the images whose patches L_patch compares; None without this loss.
     """
 
     def __init__(
@@ -100,6 +91,7 @@ class VolSdfHost(nn.Module):
         super().__init__()
         self.config = config
         self.starts_from_shape = False
+        self.patch_views: PatchViews | None = None
         self.radiance_scale = facts.radiance_scale
         self.background_kind = facts.background
         # Buffers follow the host to its device. They are not in checkpoints, as the capture has them.
@@ -140,8 +132,8 @@ class VolSdfHost(nn.Module):
         return self._render_visible_parts(rays)
 
     def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
-        """As `render`, with those of the losses eikonal, hessian, surface, point_cloud and mask in
-        `names`.
+        """As `render`, with those of the losses eikonal, hessian, surface, point_cloud, mask and patches
+        in `names`.
         """
         march = self._march(batch.rays)
         if march.surface.distance.requires_grad:
@@ -371,6 +363,9 @@ class VolSdfHost(nn.Module):
             terms["point_cloud"] = losses.point_cloud(sample.distance, sample.gradient, drawn.normal)
         if "mask" in names:
             terms["mask"] = self._mask_loss(march, batch)
+        if "patches" in names and self.patch_views is not None:
+            share = self.config.shading.hit_share
+            terms["patches"] = patch_loss(self.patch_views, self._surface, march.hits, batch, share)
         return terms
 
     def _mask_loss(self, march: March, batch: PixelBatch) -> LossTerm:

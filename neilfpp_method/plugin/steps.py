@@ -45,6 +45,7 @@ from neilfpp_method.train.optimizer import (
     set_rates,
     waiting_fields,
 )
+from neilfpp_method.train.patches import show_patches
 from neilfpp_method.train.skipped import Moment
 from neilfpp_method.train.vanished import restore_surface
 
@@ -125,6 +126,7 @@ class Steps:
             if step == 0:
                 self._review_before_stage(step)
             self.neilf.freeze_for(position.stage)
+            show_patches(self.neilf, self.pixels, position.stage)
             self._set_up_for = position.stage
         waiting = waiting_fields(self.neilf, self.rates, position)
         for optimizer in optimizers.optimizers.values():

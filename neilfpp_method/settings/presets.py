@@ -147,6 +147,7 @@ FAST: Mapping[str, Any] = {
     "loss.surface": 1e-2,
     "loss.surface_joint": 1e-3,
     "loss.point_cloud": 0.1,
+    "loss.patches": 0.5,
     "loss.mask": 1.0,
     "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,

@@ -284,6 +284,8 @@ class LossConfig:
     """Weight of L_surf in the joint stage."""
     point_cloud: float = 0.0
     """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
+    patches: float = 0.0
+    """Weight of L_patch in SDF init: patches of the surface look alike in all views that show them."""
     smoothness: float = 5e-4
     """Weight of L_smth: roughness and metallic are smooth where the image is."""
     lambertian: float = 5e-4

@@ -18,6 +18,7 @@ from neilfpp_method.train import deciding
 from neilfpp_method.train.deciding import Subject
 from neilfpp_method.train.light_record import note_fit
 from neilfpp_method.train.optimizer import Stream, seed_stream
+from neilfpp_method.train.patches import pose_patches
 from neilfpp_method.train.poses import camera_centers, corrected, is_fit_due
 from neilfpp_method.train.training import Training
 
@@ -104,6 +105,7 @@ def apply_poses(run: Training) -> None:
     if poses is None:
         return
     run.pixels = given.pixels.posed(corrected(given.pixels.capture, poses))
+    pose_patches(run.model, run.pixels)
     run.quality.pixels = poses.motion.of(given.held_back)
     if given.checked is not None:
         run.watch.pixels = poses.motion.of(given.checked)

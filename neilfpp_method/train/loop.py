@@ -59,6 +59,7 @@ from neilfpp_method.train.optimizer import (
     set_rates,
     waiting_fields,
 )
+from neilfpp_method.train.patches import show_patches
 from neilfpp_method.train.quality import read_checks, write_checks
 from neilfpp_method.train.skipped import Moment, keep_with_note
 from neilfpp_method.train.training import Training
@@ -88,6 +89,7 @@ def train(run: Training) -> None:
         review_before_stage(run, step)
     while step < total_steps(run.config.train):
         position = stage_at(step, run.config.train)
+        show_patches(run.model, run.pixels, position.stage)
         step = _train_stage(run, optimizer, position, step)
         if run.fabric.is_global_zero:
             with timed("checks", undivided=True):

@@ -10,14 +10,18 @@ from pathlib import Path
 import torch
 from torch.autograd import anomaly_mode
 
+from neilfpp_method.data.capture import Capture
+from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.schedule import active_losses, weigh
+from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.build import build_model
 from neilfpp_method.train.checkpoint import load_weights
 from neilfpp_method.train.effects_record import read_plan
 from neilfpp_method.train.first_not_finite import Origin, OriginsOfNotFinite, is_finite
-from neilfpp_method.train.run import read_description
+from neilfpp_method.train.patches import show_patches
+from neilfpp_method.train.poses import corrected
+from neilfpp_method.train.run import PIXELS, read_description
 from neilfpp_method.train.skipped import SkippedStep, load_step
 
 __all__ = ["Rerun", "rerun_step", "rerun_summary"]
@@ -64,8 +68,18 @@ def rerun_step(run: Path, step: int) -> Rerun:
     model.use(plan.config)
     load_weights(model, skipped.model, run)
     model.train().freeze_for(skipped.stage)
+    _show_patches(model, capture, run, skipped.stage)
     torch.set_rng_state(skipped.random)
     return _run_step(model, skipped)
+
+
+def _show_patches(model: NeilfModel, capture: Capture, run: Path, stage: Stage) -> None:
+    """Show the host the training views if the step compares patches of them."""
+    if "patches" not in active_losses(stage, model.config, model.stages):
+        return
+    pixels = PixelDataset(capture, capture.train_views, folder=run / PIXELS)
+    posed = pixels if model.poses is None else pixels.posed(corrected(capture, model.poses))
+    show_patches(model, posed, stage)
 
 
 def _run_step(model: NeilfModel, skipped: SkippedStep) -> Rerun:

@@ -41,6 +41,7 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import initial_model, scene_facts
 from neilfpp_method.train.device import waiting
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, set_rates
+from neilfpp_method.train.patches import show_patches
 from neilfpp_method.train.preview import preview_pixels
 
 __all__ = ["Trial", "TrialLimits", "TrialTooLong", "Workload", "run_trial"]
@@ -318,6 +319,7 @@ def _steps_per_fit(config: NeilfConfig) -> int:
 def _measure_stage(setup: _Setup, stage: Stage, limit: float, check_time: Callable[[], None]) -> _StageTimes:
     """Time the steps of a stage for about `limit` seconds, and its picture and health check."""
     model, with_material = setup.model, setup.model.stages[stage].trains_material
+    show_patches(model, setup.pixels, stage)
     times = _train_steps(setup, stage, limit, check_time)
     check_time()
     model.eval()

@@ -21,7 +21,7 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.distance_grid import SignedDistance, cell_size, look_up, sample_grid
 from neilfpp_method.volume.intersect import Interval
 
-__all__ = ["EmptySpace", "Span"]
+__all__ = ["EmptySpace", "EvaluationSpace", "Span"]
 
 RAY_PARTS = 128
 """Number of parts of a ray; the grid is read once in each."""
@@ -222,3 +222,14 @@ def _span(edges: Float[Tensor, "N E"], taken: Bool[Tensor, "N K"], interval: Int
             torch.where(has_part, edges.gather(-1, last)[:, 0], interval.far),
         ),
     )
+
+
+@dataclass(frozen=True)
+class EvaluationSpace:
+    """Empty space of a G that is not being trained, and the versions of the parameters that G had then.
+
+    The versions show that weights were loaded. They do not show every training step (`hosts.volsdf`).
+    """
+
+    versions: list[tuple[int, int]]
+    space: EmptySpace

@@ -14,6 +14,7 @@ from neilfpp_method.schedule import Stage, active_losses, stage_steps, weigh
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.structures import OrientedPoints
+from tests.hosts.test_patches import views
 from tests.scenes import sphere_batch
 
 
@@ -26,6 +27,7 @@ def test_a_step_of_every_stage(name):
     facts = SceneFacts("linear", 0.2, 3.0, "constant", log_gains=(0.1, 0.0, 0.0, -0.1, 0.0, 0.0))
     direction = torch.nn.functional.normalize(torch.randn(50, 3), dim=-1)
     host = VolSdfHost(config, facts, points=OrientedPoints(0.6 * direction, direction))
+    host.patch_views = views()
     model = NeilfModel(host, config, facts)
     batch = sphere_batch(6, spread=0.3)
     for stage in Stage:
