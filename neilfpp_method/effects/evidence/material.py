@@ -60,7 +60,7 @@ FITS = 14
 """Time of all measurements at places before one stage, in units of the time of one fit of this size
 (estimate): 8 fits, 6 that take a quarter of the time, and the noise of lobe sampling.
 """
-OTHER_TIME_SHARE = 0.5
+OTHER_TIME_SHARE = 1.5
 """Time of all work other than descent, as a share of that of descent (estimate)."""
 SHARED_ROUGHNESSES = (2, 4, 6, 8)
 """Indices in `ROUGHNESSES` that are tried as the common roughness of all places."""
@@ -118,8 +118,8 @@ def material_evidence(
 def seconds_of_evidence(device: torch.device) -> float:
     """Estimate the time of the measurements at places before one stage on this machine, in seconds.
 
-    The estimate assumes that every place has `VIEWS` views. Most of the time goes to the descent on the
-    light, whose steps are timed (`places.fit.seconds_of_step`).
+    The estimate assumes that every place has `VIEWS` views. Steps of the descent on the light are timed
+    (`places.fit.seconds_of_step`); all other work is in proportion.
     """
     step = seconds_of_step(PLACES * VIEWS * (FOLDS - 1) // FOLDS, device)
     return (1 + OTHER_TIME_SHARE) * FITS * (FIRST_STEPS + (ROUNDS - 1) * STEPS) * step
