@@ -2,7 +2,7 @@
 
     python scripts/check_pythons.py      needs an index for pip; writes build/pythons
 
-Resolving reads metadata alone (a build of torch can have gigabytes). To start the command takes its two
+Resolving reads metadata alone (a build of torch can have gigabytes). To start the command takes three
 imports; the whole package is compiled to byte code, which finds syntax that an older Python does not know.
 `make package PYTHON=python3.10` installs everything on one Python.
 """
@@ -21,7 +21,7 @@ MINOR_VERSIONS = range(10, 15)
 """3.10 is `requires-python`; the last is the newest that has wheels of all dependencies."""
 NEW_PIP = "pip>=24"
 """Older ones download whole packages to resolve them."""
-IMPORTS_OF_HELP = ("tyro", "rich")
+IMPORTS_OF_HELP = ("tyro", "rich", "PyYAML")
 
 
 def main() -> int:
