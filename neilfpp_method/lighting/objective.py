@@ -24,6 +24,7 @@ __all__ = [
     "DARK_FLOOR",
     "ERROR_FLOOR",
     "EVENNESS",
+    "STEPS",
     "Objective",
     "Target",
     "error_unit",

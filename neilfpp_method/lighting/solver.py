@@ -25,7 +25,7 @@ from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.memory import SurfaceMemory
-from neilfpp_method.lighting.objective import DARK_FLOOR, Objective
+from neilfpp_method.lighting.objective import DARK_FLOOR, STEPS, Objective
 from neilfpp_method.lighting.sky import SkySightings
 from neilfpp_method.lighting.solve import solve_light
 from neilfpp_method.settings.facts import RadianceUnits, SceneFacts
@@ -41,6 +41,11 @@ JudgeLamps = Callable[[Lamps, Lobe | None, SceneTracer | None], Evidence]
 START_ROWS = 16
 """Rows of the map while lamps are sought beside an initial map. The five comparisons then take seconds: these
 are a ninth of the texels of preset `fast`.
+"""
+START_STEPS = 300
+"""Steps of these fits, which start without lamps. After 100 steps the gain by lamps on recovered geometry
+varied from −0.1 to 2.9 % between random candidates, in a scene with lamps; after 300 from 1.9 to 3.7 %. In
+two scenes without lamps it is below 0.3 %.
 """
 
 
@@ -281,6 +286,7 @@ class MapSolver(nn.Module):
             self.unit,
             sky=sky,
             monochrome=self.config.monochrome,
+            steps=START_STEPS if at_start else STEPS,
             log_scale=None if sky is not None and sky.fixes_scale else self._log_scale(material),
         )
         points, config = FitPoints(observed, material, self.lobe, scene), self.config

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.health.watch import Watch
 from neilfpp_method.lighting import solver
-from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model, scene_facts
@@ -71,7 +69,8 @@ def short_light_fits() -> Iterator[None]:
     Fits of the usual length take most of the time of a small training, and amplify rounding.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solver, "Objective", partial(Objective, steps=FIT_STEPS))
+        for name in ("STEPS", "START_STEPS"):
+            patch.setattr(solver, name, FIT_STEPS)
         yield
 
 
