@@ -6,16 +6,13 @@ for wide factors, and take several times as long as reading the matrix once.
 
 from __future__ import annotations
 
-import importlib
-from functools import lru_cache
-from types import ModuleType
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
+from neilfpp_method.kernels.loops import loops
 from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["times_channels"]
@@ -56,7 +53,7 @@ class _TimesChannels(torch.autograd.Function):
 def _transposed_product(matrix: Float[Tensor, "R T"], weights: Float[Tensor, "R 3"]) -> Float[Tensor, "T 3"]:
     """matrix.T @ weights, reading the matrix once, row by row."""
     takes = matrix.device.type == "cpu" and matrix.dtype in (torch.float32, torch.float64)
-    if not takes or _loops() is None:
+    if not takes or loops() is None:
         return (weights.t() @ matrix).t()
     rows, factors = matrix.detach().contiguous().numpy(), weights.detach().contiguous().numpy()
     ranges = shares(len(rows), MIN_ROWS_PER_THREAD)
@@ -64,15 +61,7 @@ def _transposed_product(matrix: Float[Tensor, "R T"], weights: Float[Tensor, "R 
     # One sum per thread, and all of them in a fixed order: the result depends only on the number of threads.
     of_range = dict(zip(ranges, sums.numpy(), strict=True))
     for_each(
-        lambda start, stop: _loops().add_weighted_rows(rows, factors, of_range[start, stop], start, stop),
+        lambda start, stop: loops().add_weighted_rows(rows, factors, of_range[start, stop], start, stop),
         ranges,
     )
     return sums.sum(0).t()
-
-
-@lru_cache(maxsize=1)
-def _loops() -> ModuleType | None:
-    try:
-        return importlib.import_module("neilfpp_method.kernels.compiled")
-    except ImportError:
-        return None

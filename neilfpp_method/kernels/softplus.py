@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
-from functools import lru_cache
-from types import ModuleType
 
 import numpy as np
 import torch
@@ -14,6 +11,7 @@ from torch import Tensor
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
+from neilfpp_method.kernels.loops import loops
 from neilfpp_method.kernels.threads import for_each, shares
 
 __all__ = ["UnitSample", "softplus", "softplus_and_slope"]
@@ -77,21 +75,12 @@ class _Softplus(torch.autograd.Function):
 
 def _takes(z: Tensor) -> bool:
     """Whether the loops support this tensor; torch supports any."""
-    return z.device.type == "cpu" and z.dtype == torch.float32 and _loops() is not None
-
-
-@lru_cache(maxsize=1)
-@torch.compiler.disable
-def _loops() -> ModuleType | None:
-    try:
-        return importlib.import_module("neilfpp_method.kernels.compiled")
-    except ImportError:
-        return None
+    return z.device.type == "cpu" and z.dtype == torch.float32 and loops() is not None
 
 
 @torch.compiler.disable
 def _run(loop: str, sharpness: float, *tensors: Tensor) -> None:
-    work, arrays = getattr(_loops(), loop), [_flat(tensor) for tensor in tensors]
+    work, arrays = getattr(loops(), loop), [_flat(tensor) for tensor in tensors]
     for_each(
         lambda start, stop: work(*arrays, sharpness, start, stop),
         shares(tensors[0].numel(), MIN_VALUES_PER_THREAD),

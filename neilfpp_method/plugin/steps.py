@@ -16,6 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor, nn
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.following import follow_fit
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.table import effects_table
 from neilfpp_method.health.guard import StepGuard
@@ -30,7 +31,6 @@ from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
 from neilfpp_method.train.deciding import (
     Subject,
-    follow_fit,
     improve_half_trained,
     is_improvement_due,
     review_before_material,
@@ -215,7 +215,7 @@ class Steps:
 
     def _subject(self) -> Subject:
         seed = self.settings.train.seed
-        return Subject(self.plan, self.neilf, self.light_solver, self.pixels, seed, CONSOLE.log)
+        return Subject(self.plan, self.neilf, self.light_solver, CONSOLE.log, self.pixels, seed)
 
     @property
     def _device(self) -> torch.device:

@@ -6,12 +6,11 @@ the number of the step, so all loops decide alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
-from neilfpp_method.effects import following
-from neilfpp_method.effects.following import Followers
+from neilfpp_method.effects.following import Followers, follow, improve, start_light
 from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
@@ -24,15 +23,12 @@ from neilfpp_method.effects.review import (
     review_surface,
 )
 from neilfpp_method.lighting.fit import Evidence
-from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import StagePosition
 from neilfpp_method.train.optimizer import Stream, seed_stream
 
 __all__ = [
     "Subject",
-    "follow",
-    "follow_fit",
     "improve_half_trained",
     "is_improvement_due",
     "review_before_material",
@@ -43,31 +39,18 @@ Review = Callable[[Plan, NeilfModel, PixelDataset, int], list[Decision]]
 
 
 @dataclass(frozen=True)
-class Subject:
-    """What is measured, and what follows the decisions.
+class Subject(Followers):
+    """What is measured, besides what follows the decisions.
 
     Attributes:
-        plan: the effects; decisions are added to it.
-        model: the model in training, which uses the settings of the plan.
-        light_solver: fits the light of this model.
         pixels: the training pixels, on the device of the model.
         seed: seed of the training.
-        say: prints a line.
         max_pixels: maximum number of pixels of the places for the initial light; a budget may limit it.
     """
 
-    plan: Plan
-    model: NeilfModel
-    light_solver: LightSolver
     pixels: PixelDataset
     seed: int
-    say: Callable[[str], object]
     max_pixels: int = MAX_PIXELS
-
-    @property
-    def followers(self) -> Followers:
-        """What follows the decisions."""
-        return Followers(self.plan, self.model, self.light_solver, self.say)
 
 
 def review_before_material(subject: Subject, step: int) -> Evidence | None:
@@ -84,11 +67,6 @@ def review_before_material(subject: Subject, step: int) -> Evidence | None:
     evidence = _start_light(subject, step)
     _review(subject, step, review_material, Stream.MATERIAL)
     return evidence
-
-
-def follow_fit(subject: Subject, evidence: Evidence | None, step: int) -> None:
-    """Record what a fit of the light after `step` steps has decided on lamps."""
-    following.follow_fit(subject.followers, evidence, step)
 
 
 def is_improvement_due(subject: Subject, position: StagePosition) -> bool:
@@ -111,12 +89,7 @@ def improve_half_trained(subject: Subject, position: StagePosition, step: int) -
         return
     seed_stream(subject.seed, Stream.SEARCH, step)
     places = light_places(model, subject.pixels, subject.max_pixels)
-    following.improve(subject.followers, places, is_search_due(position), step)
-
-
-def follow(subject: Subject, decisions: Sequence[Decision]) -> None:
-    """Print decisions, and use the settings that follow from the plan."""
-    following.follow(subject.followers, decisions)
+    improve(subject, places, is_search_due(position), step)
 
 
 def _review(subject: Subject, step: int, review: Review, stream: Stream) -> None:
@@ -133,4 +106,4 @@ def _start_light(subject: Subject, step: int) -> Evidence | None:
     subject.say("fitting light and material at selected places, to decide on effects …")
     seed_stream(subject.seed, Stream.LIGHT, step)
     review = review_light(subject.plan, subject.model, subject.pixels, step, subject.max_pixels)
-    return following.start_light(subject.followers, review, step)
+    return start_light(subject, review, step)

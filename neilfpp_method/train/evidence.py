@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from neilfpp_method.effects.evidence.poses import next_motion
+from neilfpp_method.effects.following import follow, follow_fit
 from neilfpp_method.effects.plan import Decision
 from neilfpp_method.effects.review import MAX_PIXELS, review_poses
 from neilfpp_method.schedule import StagePosition, stage_at
@@ -53,7 +54,7 @@ def observe_and_solve(run: Training, computed: StepResult, step: int) -> None:
         with timed("light_fits", undivided=True):
             evidence = solver.solve(run.model.brdf, run.model.scene)
         note_fit(run.fits, evidence, run.model.lamps.count, step + 1)
-        deciding.follow_fit(_subject(run), evidence, step + 1)
+        follow_fit(_subject(run), evidence, step + 1)
     _share_light(run)
 
 
@@ -89,7 +90,7 @@ def fit_poses(run: Training, position: StagePosition, step: int) -> None:
         nonlocal motion
         with timed("checks", undivided=True):
             seed_stream(run.config.train.seed, Stream.POSES, step)
-            deciding.follow(subject, review_poses(run.plan, model, run.given.pixels, step))
+            follow(subject, review_poses(run.plan, model, run.given.pixels, step))
             if run.plan.is_on("poses"):
                 centers = camera_centers(run.given.pixels.capture).to(motion.shift)
                 motion = next_motion(model, run.given.pixels, motion, centers)

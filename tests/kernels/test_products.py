@@ -22,7 +22,7 @@ def factors(shape: tuple[int, ...], dtype: torch.dtype = torch.float32) -> tuple
 @pytest.mark.parametrize("with_loops", [True, False])
 def test_products_and_gradients_are_those_of_float64(shape, with_loops, monkeypatch):
     if not with_loops:
-        monkeypatch.setattr(products, "_loops", lambda: None)
+        monkeypatch.setattr(products, "loops", lambda: None)
     matrix, channels = (values.requires_grad_() for values in factors(shape))
     product = times_channels(matrix, channels)
     weight = torch.randn(product.shape)

@@ -35,6 +35,6 @@ def test_lamps_of_the_initial_light_are_sought_with_the_decided_lobe(
     monkeypatch.setattr(deciding, "review_light", review_light)
     monkeypatch.setattr(following, "start_with", start_with)
     assert run.light_solver.lobe is LOBES["ggx"]
-    subject = Subject(plan, run.model, run.light_solver, run.pixels, 0, run.reporter.say)
+    subject = Subject(plan, run.model, run.light_solver, run.reporter.say, run.pixels, 0)
     review_before_material(subject, step=4)
     assert started == [LOBES["spherical_gaussian"]]

@@ -16,8 +16,8 @@ from neilfpp_method.shading.color import luminance
 __all__ = ["GrayView", "gray_of"]
 
 MAX_SIDE = 640
-"""Longest side of the compared images, in pixels; a larger image is scaled down. Time and memory grow with
-the third power of it, because the number of planes grows as well."""
+"""Longest side of the compared images, in pixels; a larger image is scaled down. Time and memory of
+stereo grow with the third power of it, because the number of planes grows as well."""
 
 
 @dataclass(frozen=True)
