@@ -82,14 +82,14 @@ def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
     compared = {
         "preset": config,
         "free light, with L_ref": free,
-        "free light, without L_ref": changed(free, "inter_reflection", mode="off"),
+        "free light, without L_ref": changed(free, "light", inter_reflection="off"),
     }
     if which == "ladder":
-        compared["free light, hard"] = changed(free, "inter_reflection", mode="hard")
+        compared["free light, hard"] = changed(free, "light", inter_reflection="hard")
         for kind, name in (("distant", "map"), ("distant_near", "map and lamps")):
-            light = changed(config, "light", kind=kind)
             compared |= {
-                f"{name}, {mode}": changed(light, "inter_reflection", mode=mode) for mode in ("hard", "off")
+                f"{name}, {mode}": changed(config, "light", kind=kind, inter_reflection=mode)
+                for mode in ("hard", "off")
             }
     return compared
 

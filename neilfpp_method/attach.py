@@ -83,7 +83,7 @@ class AttachedNeilf(nn.Module):
         host, config, facts = model.host, model.config, model.facts
         # Only tracing light between surfaces needs a host that renders rays from any viewpoint.
         renders_secondary_rays = (
-            model.borrowed and config.inter_reflection.mode != "off" and answers_secondary_rays(_inner(host))
+            model.borrowed and config.light.inter_reflection != "off" and answers_secondary_rays(_inner(host))
         )
         render = host.render if renders_secondary_rays else None
         self.first_batches = FirstBatches(
@@ -293,7 +293,7 @@ class AttachedNeilf(nn.Module):
         self.first_batches.hits(batch, hits)
         self._last_rendered = batch, hits.detach()
         # A proxy only traces rays between surfaces.
-        if isinstance(self.model.host, ForeignHost) and self.model.config.inter_reflection.mode != "off":
+        if isinstance(self.model.host, ForeignHost) and self.model.config.light.inter_reflection != "off":
             self.model.host.update_proxy(batch.rays, hits)
 
 

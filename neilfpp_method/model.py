@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,8 +14,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method import losses
-from neilfpp_method.fields import BrdfField, LightModel, PhotographGains, at_mean_exposure, make_light
-from neilfpp_method.fields.poses import PoseCorrections
+from neilfpp_method.fields import (
+    BrdfField,
+    LightModel,
+    PhotographGains,
+    PoseCorrections,
+    at_mean_exposure,
+    make_light,
+)
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import Sources, arriving, incident_radiance, scene_tracer, trace_light
@@ -79,7 +84,7 @@ class NeilfModel(nn.Module):
         observers: callbacks that get the batch and the host's hits of every training step, before shading.
 
     Raises:
-        UserError: settings that exclude each other (`settings.check`).
+        UserError: a setting is out of range (`settings.check`).
     """
 
     def __init__(self, host: Host, config: NeilfConfig, facts: SceneFacts, borrowed: bool = False) -> None:
@@ -154,7 +159,8 @@ class NeilfModel(nn.Module):
             return StepResult.of({}, SurfacePixels.empty_like(batch), batch[:0])
         reuses_points = self.training and not plan.trains_host
         if reuses_points:
-            batch, hits = self._rays_to_render(batch, hits)
+            rows = self.replay.rows_to_render(len(batch))
+            batch, hits = batch[rows], None if hits is None else hits[rows]
 
         # 1. Geometry G and outgoing radiance R: render colour, hit position and normal of each camera ray.
         hits, terms = self._render_host(batch, plan, active, hits)
@@ -189,13 +195,6 @@ class NeilfModel(nn.Module):
         if "inter_reflection" in active:
             terms["inter_reflection"] = self._inter_reflection(position, normal)
         return StepResult.of(terms, rendered, self._background_pixels(batch, hits))
-
-    def _rays_to_render(
-        self, batch: PixelBatch, hits: SurfaceHits | None
-    ) -> tuple[PixelBatch, SurfaceHits | None]:
-        """The part of a batch that is rendered; replayed points of earlier steps stand in for the rest."""
-        rendered = slice(math.ceil(self.replay.share * len(batch)))
-        return batch[rendered], None if hits is None else hits[rendered]
 
     @timed("rendering")
     def _render_host(
@@ -296,7 +295,7 @@ class NeilfModel(nn.Module):
     @property
     def scene(self) -> SceneTracer | None:
         """Traces light between surfaces of the scene; None unless inter-reflection is hard."""
-        if self.config.inter_reflection.mode != "hard":
+        if self.config.light.inter_reflection != "hard":
             return None
         return scene_tracer(self.host, self.config.ray_offset, self.config.shading.hit_share)
 

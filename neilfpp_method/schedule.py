@@ -267,7 +267,7 @@ def active_losses(
     }
     if plan.trains_material:
         weights["physical"] = 1.0
-        if config.inter_reflection.mode == "soft":
+        if config.light.inter_reflection == "soft":
             weights["inter_reflection"] = INTER_REFLECTION
     if config.optimizer.exposure > 0 and "volume" in weights:
         weights["exposure"] = EXPOSURE_PRIOR

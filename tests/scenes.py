@@ -24,11 +24,10 @@ def tiny_config(**changes) -> NeilfConfig:
         encoding=HashGridConfig(levels=3, log2_entries=10, sdf_log2_entries=10, max_resolution=32),
         radiance=dataclasses.replace(config.radiance, layers=1, width=16),
         brdf=dataclasses.replace(config.brdf, layers=1, width=16),
-        light=dataclasses.replace(config.light, layers=4, width=16),
+        light=dataclasses.replace(config.light, layers=4, width=16, rays_per_point=0.5),
         background=dataclasses.replace(config.background, samples=4),
         volume=dataclasses.replace(config.volume, samples=20, beta_init=0.02, skip_empty=False),
         shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
-        inter_reflection=dataclasses.replace(config.inter_reflection, rays_per_point=0.5),
         loss=dataclasses.replace(config.loss, lambertian=5e-4),  # every loss of the table counts
         train=TrainConfig(sdf_steps=4, material_steps=4, joint_steps=4, rays=48, checkpoint_every=3),
     )

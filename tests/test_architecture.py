@@ -52,6 +52,7 @@ ONLY = {
     "errors": set(),
 }
 MAX_LINES = 400
+MAX_IMPORTS_OF_MODEL = 15
 MAX_AT_THE_TOP = 8
 
 
@@ -156,6 +157,11 @@ def test_no_untrusted_file_is_unpickled(source):
 def test_the_top_level_has_few_modules():
     top = {path.name for path in ROOT.glob("*.py")} - {"__init__.py"}
     assert len(top) <= MAX_AT_THE_TOP, sorted(top)
+
+
+def test_the_model_needs_few_modules():
+    imported = {name for name in imports(ast.parse((ROOT / "model.py").read_text())) if name in SOURCES}
+    assert len(imported) <= MAX_IMPORTS_OF_MODEL, sorted(imported)
 
 
 def test_modules_are_short(source):

@@ -42,7 +42,6 @@ def hard_config():
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, kind="distant", environment_height=8),
-        inter_reflection=fast.inter_reflection,
         train=dataclasses.replace(config.train, sdf_steps=0),
     )
 
@@ -65,9 +64,7 @@ class Counted(Ball):
 def test_given_hits_are_not_rendered_again_and_give_the_same_losses(form):
     host, rays = Counted(), ball_rays(64, 0.8)
     config = tiny_config()
-    config = dataclasses.replace(
-        config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off")
-    )
+    config = dataclasses.replace(config, light=dataclasses.replace(config.light, inter_reflection="off"))
     neilf = attach_neilf(host, config)
     color, position, normal = host(rays.origins, rays.directions)
     depth = ((position - rays.origins) * rays.directions).sum(-1, keepdim=True)

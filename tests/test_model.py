@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from neilfpp_method import losses
-from neilfpp_method.errors import UserError
 from neilfpp_method.hosts.base import TracesLight
 from neilfpp_method.incident.scene import scene_light
 from neilfpp_method.incident.traced import trace_light
@@ -57,14 +56,14 @@ def test_an_effect_that_is_off_makes_no_queries():
     base = tiny_config()
     # With β = 0.02 a quarter of a ray's weight lies further than 0.05 from its hit.
     base = dataclasses.replace(base, shading=dataclasses.replace(base.shading, hit_share=0.5))
-    off = dataclasses.replace(base.inter_reflection, mode="off")
+    off = dataclasses.replace(base.light, inter_reflection="off")
     batch = sphere_batch()
 
     def queries(config):
         model = sphere_model(config)
         return count_queries(model, lambda: model.losses(batch, Stage.MATERIAL_INIT))
 
-    on, without = queries(base), queries(dataclasses.replace(base, inter_reflection=off))
+    on, without = queries(base), queries(dataclasses.replace(base, light=off))
     assert without["rays"] == len(batch)  # the camera's rays and no others
     assert on["rays"] > without["rays"]
     assert without["light"] % base.shading.train_samples == 0
@@ -142,8 +141,8 @@ class Room:
 
 def with_rays_per_point(count: float) -> NeilfConfig:
     settings = tiny_config()
-    rays = dataclasses.replace(settings.inter_reflection, rays_per_point=count)
-    return dataclasses.replace(settings, inter_reflection=rays)
+    light = dataclasses.replace(settings.light, rays_per_point=count)
+    return dataclasses.replace(settings, light=light)
 
 
 def test_traced_light_is_the_radiance_of_the_wall():
@@ -280,10 +279,7 @@ class HalfRoom(Room):
 
 
 def test_hard_inter_reflection_uses_the_scene_for_hits_and_the_light_otherwise():
-    config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard")
-    distant = MapLightConfig(kind="distant")
-    config = dataclasses.replace(config, inter_reflection=hard, light=distant)
+    config = tiny_config(light=MapLightConfig(kind="distant"))
     model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant"))
     wi = torch.nn.functional.normalize(torch.randn(1, 64, 3), dim=-1)
     arriving = model.incident_light(torch.zeros(1, 3), wi)[0]
@@ -304,8 +300,8 @@ def test_an_sdf_host_traces_its_grid():
     one.
     """
     config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard")
-    config = dataclasses.replace(config, inter_reflection=hard)
+    hard = dataclasses.replace(config.light, inter_reflection="hard")
+    config = dataclasses.replace(config, light=hard)
     host = sphere_model(config).host
     assert isinstance(host, TracesLight)
     out = torch.tensor([[0.0, 0.0, 1.0]])
@@ -327,13 +323,13 @@ def test_an_sdf_host_traces_its_grid():
 
 def test_the_tracing_grid_is_sampled_again_and_is_in_checkpoints():
     config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard")
-    model = sphere_model(dataclasses.replace(config, inter_reflection=hard))
+    hard = dataclasses.replace(config.light, inter_reflection="hard")
+    model = sphere_model(dataclasses.replace(config, light=hard))
     model.losses(sphere_batch(), Stage.MATERIAL_INIT)
     assert model.host.grid_age == 0
     model.losses(sphere_batch(), Stage.JOINT)
     assert model.host.grid_age == 1
-    again = sphere_model(dataclasses.replace(config, inter_reflection=hard))
+    again = sphere_model(dataclasses.replace(config, light=hard))
     again.load_state_dict(model.state_dict())
     assert again.host.grid_age == 1
     assert torch.equal(again.host.distance_grid, model.host.distance_grid)
@@ -344,11 +340,10 @@ def test_the_tracing_grid_is_sampled_again_and_is_in_checkpoints():
 def test_every_light_works_with_every_sampler(kind, sampler):
     """Under light of equal radiance from all directions, all samplers give the same result."""
     config = tiny_config()
-    off = dataclasses.replace(config.inter_reflection, mode="off")
+    light = config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=8)
     config = dataclasses.replace(
         config,
-        inter_reflection=off,
-        light=config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=8),
+        light=dataclasses.replace(light, inter_reflection="off"),
         shading=dataclasses.replace(config.shading, sampler=sampler),
     )
     model = sphere_model(config).eval()
@@ -364,10 +359,7 @@ def test_every_light_works_with_every_sampler(kind, sampler):
 
 
 def test_a_lamp_lights_only_unoccluded_points():
-    config = tiny_config()
-    hard = dataclasses.replace(config.inter_reflection, mode="hard")
-    light = MapLightConfig(kind="auto", environment_height=8)
-    config = dataclasses.replace(config, inter_reflection=hard, light=light)
+    config = tiny_config(light=MapLightConfig(kind="auto", environment_height=8))
     model = NeilfModel(HalfRoom(), config, SceneFacts("linear", 0.2, 3.0, "constant")).eval()
     x, up = torch.zeros(2, 3), torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     half = torch.full((2, 1), 0.5)
@@ -382,10 +374,3 @@ def test_a_lamp_lights_only_unoccluded_points():
     assert gained[1].item() == pytest.approx(0.0, abs=1e-6)
     seen = model.incident_light(x[:1], torch.tensor([[[0.0, 0.0, 1.0]]]))[0, 0]
     assert (seen > model.lamps.radiance()[0]).all()
-
-
-def test_l_ref_cannot_train_a_map():
-    config = tiny_config()
-    config = dataclasses.replace(config, light=MapLightConfig(kind="distant"))
-    with pytest.raises(UserError, match="soft inter-reflection"):
-        sphere_model(config)

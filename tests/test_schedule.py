@@ -88,9 +88,7 @@ def test_rates_rise_from_a_tenth():
 
 def test_an_effect_that_is_off_has_no_loss():
     config = preset("fast")
-    off = dataclasses.replace(
-        config, inter_reflection=dataclasses.replace(config.inter_reflection, mode="off")
-    )
+    off = dataclasses.replace(config, light=dataclasses.replace(config.light, inter_reflection="off"))
     assert "inter_reflection" not in active_losses(Stage.JOINT, off)
     matte = dataclasses.replace(config, shading=dataclasses.replace(config.shading, specular=False))
     assert not {"smoothness", "lambertian"} & set(active_losses(Stage.JOINT, matte))

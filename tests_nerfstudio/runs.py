@@ -55,7 +55,6 @@ def small_settings(**steps: int) -> NeilfConfig:
         config,
         volume=dataclasses.replace(config.volume, beta_final=usual.volume.beta_final),
         light=dataclasses.replace(usual.light, environment_height=8, fit=fit),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode=usual.inter_reflection.mode),
         optimizer=dataclasses.replace(config.optimizer, exposure=0.0),
     )
 

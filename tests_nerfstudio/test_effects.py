@@ -137,7 +137,7 @@ def test_the_commands_use_the_decided_settings(ball_run: Path) -> None:
     _, pipeline, _, _ = eval_setup(ball_run / "config.yml")
     for config in (loaded.config, loaded.model.config, pipeline.model.neilf.config):
         assert not config.brdf.metals
-        assert config.inter_reflection.mode == "off"
+        assert config.light.inter_reflection == "off"
     assert effects(ball_run) == effects(ball_run / "neilfpp"), "also beside config.yml"
 
 
@@ -175,7 +175,7 @@ def test_as_set_measures_nothing(ball: Path, tmp_path: Path) -> None:
     config.max_num_iterations = 1
     run = ns_train(config)
     assert {d["by"] for d in effects(run)["decisions"]} <= {"settings", "files"}
-    assert load_run(run / "neilfpp").config.inter_reflection == BALL.inter_reflection
+    assert load_run(run / "neilfpp").config.light.inter_reflection == BALL.light.inter_reflection
     assert load_run(run / "neilfpp").config.brdf == BALL.brdf
 
 

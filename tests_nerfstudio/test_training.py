@@ -51,8 +51,8 @@ FIELDS = {
 }
 SETTINGS = small_settings()
 # L_ref on many rays, so that every step has some that hit.
-L_REF = dataclasses.replace(SETTINGS.inter_reflection, rays_per_point=4.0)
-FREE = free_light(dataclasses.replace(SETTINGS, inter_reflection=L_REF))
+FREE = free_light(SETTINGS)
+FREE = dataclasses.replace(FREE, light=dataclasses.replace(FREE.light, rays_per_point=4.0))
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Faults of relighting, files, health and attached hosts."""
+"""Faults of patches, light fits, relighting, files, health and attached hosts."""
 
 from __future__ import annotations
 
@@ -10,6 +10,27 @@ __all__ = ["LATER_FAULTS"]
 
 TRACER, SCATTERING = "relight/path_tracer.py", "relight/scattering.py"
 LATER_FAULTS: Sequence[Mutant] = (
+    Mutant(
+        "a hit is moved away from the surface before patches are compared",
+        "hosts/patches.py",
+        "start[near] - step",
+        "start[near] + step",
+        "hosts/test_patches.py",
+    ),
+    Mutant(
+        "patches are compared with their brightness",
+        "hosts/patches.py",
+        "own - own.mean(-1, keepdim=True), other - other.mean(-1, keepdim=True)",
+        "own, other",
+        "hosts/test_patches.py",
+    ),
+    Mutant(
+        "the gradient of a light fit contains the rows of one thread",
+        "kernels/products.py",
+        "sums.sum(0).t()",
+        "sums[0].t()",
+        "kernels/test_products.py",
+    ),
     Mutant(
         "a direction of the BRDF has the weight of light sampling",
         TRACER,

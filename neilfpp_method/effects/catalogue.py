@@ -61,15 +61,14 @@ def _none(config: NeilfConfig) -> str:
 
 
 def _traced_on(config: NeilfConfig) -> Mapping[str, Any]:
-    settings = config.inter_reflection
-    default = "soft" if isinstance(config.light, FreeLightConfig) else "hard"
-    return {"inter_reflection.mode": default if settings.mode == "off" else settings.mode}
+    default, mode = type(config.light)().inter_reflection, config.light.inter_reflection
+    return {"light.inter_reflection": default if mode == "off" else mode}
 
 
 def _traced_cost(config: NeilfConfig) -> str:
-    points, settings = config.train.rays, config.inter_reflection
+    points = config.train.rays
     if isinstance(config.light, FreeLightConfig):
-        return f"{settings.rays_per_point * points:.0f} rendered rays a step"
+        return f"{config.light.rays_per_point * points:.0f} rendered rays a step"
     return f"{config.shading.train_samples * points} traced rays a step"
 
 
@@ -115,9 +114,9 @@ EFFECTS: Mapping[str, Effect] = {
         Effect(
             name="inter-reflection",
             title="shadows and inter-reflection",
-            is_on=lambda config: config.inter_reflection.mode != "off",
+            is_on=lambda config: config.light.inter_reflection != "off",
             on=_traced_on,
-            off={"inter_reflection.mode": "off"},
+            off={"light.inter_reflection": "off"},
             obstacle=_none,
             cost=_traced_cost,
             risk="shadows and light between surfaces are baked into the base colour",

@@ -243,7 +243,7 @@ class FirstBatches:
                     "near plane",
                     f"{moved:.0%} of its hits are lost when seen from {START_DISTANCE} away, and so is "
                     "the light that surfaces close to each other exchange",
-                    "render rays that start on a surface without a near plane, or set inter_reflection.mode "
+                    "render rays that start on a surface without a near plane, or set light.inter_reflection "
                     "to 'hard', so that a proxy of the surface traces them (docs/hosts.md)",
                 )
 

@@ -51,9 +51,9 @@ def proxy_for(host: object, config: NeilfConfig) -> SurfaceProxy | None:
 
     Returns None if no proxy is needed.
     """
-    settings = config.inter_reflection
-    cannot_trace = settings.mode != "off" and not answers_secondary_rays(host)
-    if isinstance(host, TracesLight) or not (cannot_trace or settings.mode == "hard"):
+    mode = config.light.inter_reflection
+    cannot_trace = mode != "off" and not answers_secondary_rays(host)
+    if isinstance(host, TracesLight) or not (cannot_trace or mode == "hard"):
         return None
     radiance = host.radiance if isinstance(host, HasRadiance) else None
     return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)

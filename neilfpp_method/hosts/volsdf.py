@@ -109,7 +109,7 @@ class VolSdfHost(nn.Module):
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
         self.sample_counts = sample_counts(config.volume)
-        hard = config.inter_reflection.mode == "hard"
+        hard = config.light.inter_reflection == "hard"
         resolution = GRID_RESOLUTION if hard else 0
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))

@@ -63,10 +63,10 @@ def trace_light(
         host: renders the rays.
         position: surface points, scene frame.
         normal: outward unit normals.
-        config: the settings; rays per point, their start, and what counts as a hit.
+        config: the settings, with a free light: rays per point, their start, and what counts as a hit.
     """
     position, normal = position.detach(), normal.detach()
-    chosen = _random_rows(position.shape[0], config.inter_reflection.rays_per_point, position.device)
+    chosen = _random_rows(position.shape[0], config.light.rays_per_point, position.device)
     position, normal = position[chosen], normal[chosen]
     wi = _cone_directions(normal, math.cos(math.radians(MAX_ANGLE_DEG)))
     start = off_surface(host, position, normal, wi, config.ray_offset)

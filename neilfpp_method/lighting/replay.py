@@ -6,6 +6,8 @@ enough.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import nn
 
@@ -38,6 +40,10 @@ class PointReplay(nn.Module):
     def share(self) -> float:
         """Share of the rays of the next step that must be rendered."""
         return self.fresh if self.ring.full else 1.0
+
+    def rows_to_render(self, rays: int) -> slice:
+        """The first rows of a batch, which must be rendered; stored points stand in for the other rows."""
+        return slice(math.ceil(self.share * rays))
 
     def with_earlier(self, surface: SurfacePixels) -> SurfacePixels:
         """The points of a step together with stored points of earlier steps, without gradients.

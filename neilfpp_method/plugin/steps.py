@@ -105,7 +105,7 @@ class Steps:
     @property
     def traces(self) -> bool:
         """Whether rays between surfaces are traced."""
-        return self.neilf.config.inter_reflection.mode != "off"
+        return self.neilf.config.light.inter_reflection != "off"
 
     @property
     def has_material(self) -> bool:

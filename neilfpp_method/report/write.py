@@ -225,7 +225,7 @@ def _facts(files: RunFiles) -> dict[str, str]:
             f"{shading.lobe} lobe, {shading.sampler} sampler; directions per point: "
             f"{shading.train_samples} in training, {shading.eval_samples} in this report"
         ),
-        "Inter-reflection": files.config.inter_reflection.mode,
+        "Inter-reflection": files.config.light.inter_reflection,
         "Rays per step": str(files.config.train.rays),
     }
     if machine:

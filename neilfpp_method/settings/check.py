@@ -1,4 +1,7 @@
-"""Check a configuration before training: values out of range, and settings that exclude each other."""
+"""Check a configuration before training: values out of range.
+
+Settings that exclude each other cannot be written: each kind of light and of host has settings of its own.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import math
 from dataclasses import asdict
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.settings.types import InterReflectionConfig, NeilfConfig
+from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["check_config"]
 
@@ -26,7 +29,7 @@ def check_config(config: NeilfConfig) -> None:
     """Reject settings from which no model can be made, in every training loop.
 
     Raises:
-        UserError: a share or a rate is out of range, or two settings exclude each other.
+        UserError: a value is out of range.
     """
     _check_ranges(config)
     if not 0 < config.train.fresh <= 1:
@@ -41,7 +44,6 @@ def check_config(config: NeilfConfig) -> None:
             f"--config.optimizer.final {rates.final}, drops {rates.drops}, warm-up {rates.warm_up}",
             "set every value of final above 0, and the others to 0 or more",
         )
-    _check_inter_reflection(config.inter_reflection, config.light.kind)
 
 
 def _check_ranges(config: NeilfConfig) -> None:
@@ -65,11 +67,3 @@ def _require(passed: bool, config: NeilfConfig, group: str, name: str, wanted: s
     if not passed:
         option = f"--config.{group.replace('_', '-')}.{name.replace('_', '-')}"
         raise UserError(f"{option} is {getattr(getattr(config, group), name)}", f"set it to {wanted}")
-
-
-def _check_inter_reflection(settings: InterReflectionConfig, light: str) -> None:
-    if settings.mode == "soft" and light != "free":
-        raise UserError(
-            f"soft inter-reflection with the light '{light}', which the loss L_ref cannot train",
-            "set --config.inter-reflection.mode hard, or --config.light.kind free",
-        )

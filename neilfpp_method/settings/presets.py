@@ -136,8 +136,6 @@ FAST: Mapping[str, Any] = {
     "shading.sampler": "mis",
     "shading.train_samples": 64,
     "shading.eval_samples": 128,
-    "inter_reflection.mode": "hard",
-    "inter_reflection.rays_per_point": 0.25,
     "loss.unit": "median",
     "loss.volume": 2.0,
     "loss.eikonal": 0.05,
@@ -256,8 +254,8 @@ FREE_LIGHT: Mapping[str, Any] = {
         "kind": "free",
         "layers": 4,
         "width": 64,
+        "rays_per_point": 0.25,
     },
-    "inter_reflection.mode": "soft",
     "optimizer.light": 5e-3,
 }
 

@@ -116,7 +116,7 @@ class LightFitConfig:
 
 @dataclass(frozen=True)
 class MapLightConfig:
-    """L as an environment map, optionally with lamps. It requires inter-reflection "hard" or "off"."""
+    """L as an environment map, optionally with lamps. L_ref cannot train it, so there is no "soft" mode."""
 
     kind: Literal["distant", "distant_near", "auto"] = "auto"
     """free: a light field that is free at every point (the paper). distant: an environment map. distant_near:
@@ -133,6 +133,10 @@ class MapLightConfig:
     """
     fit: LightFitConfig = field(default_factory=LightFitConfig)
     """How the map and the lamps are solved for."""
+    inter_reflection: Literal["off", "hard"] = "hard"
+    """Light that surfaces of the scene send to each other (METHOD §2). hard: incident directions that hit the
+    scene bring R from there, and only the others bring the light. soft: the paper's loss L_ref. off: none.
+    """
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,12 @@ class FreeLightConfig:
     """Units per hidden layer."""
     monochrome: bool = False
     """Whether the light has a single channel."""
+    inter_reflection: Literal["off", "soft", "hard"] = "soft"
+    """Light that surfaces of the scene send to each other (METHOD §2). hard: incident directions that hit the
+    scene bring R from there, and only the others bring the light. soft: the paper's loss L_ref. off: none.
+    """
+    rays_per_point: float = 1.0
+    """Expected number of traced rays per surface point and step, for L_ref."""
 
 
 IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.AvoidSubcommands]
@@ -242,18 +252,6 @@ class ShadingConfig:
     """Incident directions per surface point in evaluation."""
     hit_share: float = 0.8
     """A ray hits, and is shaded, if at least this share of its rendering weight lies close to one point."""
-
-
-@dataclass(frozen=True)
-class InterReflectionConfig:
-    """Light that surfaces of the scene send to each other (METHOD §2)."""
-
-    mode: Literal["off", "soft", "hard"] = "soft"
-    """soft: the paper's loss L_ref. hard: incident directions that hit the scene bring R from there, and only
-    the others bring the light. off: none.
-    """
-    rays_per_point: float = 1.0
-    """Expected number of traced rays per surface point and step, for L_ref."""
 
 
 # --------------------------------------------------------------------------------------------------- training
@@ -369,7 +367,6 @@ class NeilfConfig:
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     volume: VolumeConfig = field(default_factory=VolumeConfig)
     shading: ShadingConfig = field(default_factory=ShadingConfig)
-    inter_reflection: InterReflectionConfig = field(default_factory=InterReflectionConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     train: TrainConfig = field(default_factory=TrainConfig)

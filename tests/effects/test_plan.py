@@ -211,7 +211,7 @@ def test_decisions_are_revised_and_reported():
     gone = plan.decide("inter-reflection", Measurement("directions", 0.001, 0.0005, 0.01, 400), 8)
     assert not gone.on
     assert gone.reason.startswith("revised: ")
-    assert plan.config.inter_reflection.mode == "off"
+    assert plan.config.light.inter_reflection == "off"
     assert plan.config_of_model == config
     unknown = plan.decide("inter-reflection", Measurement("directions", 0.5, 0.1, 0.01, 3), 9)
     assert not unknown.on
@@ -242,13 +242,13 @@ def test_names_switch_settings():
     none = Plan.begin(parse_effects("none"), config).config
     assert (none.shading.specular, none.light.environment_height, none.light.monochrome) == (False, 1, True)
     assert (none.brdf.metals, none.brdf.varying_roughness, none.train.joint_steps) == (False, False, 0)
-    assert (none.inter_reflection.mode, none.light.kind, none.background.kind) == (
+    assert (none.light.inter_reflection, none.light.kind, none.background.kind) == (
         "off",
         "distant",
         "constant",
     )
     everything = Plan.begin(parse_effects("all,-lamps"), config).config
-    assert (everything.inter_reflection.mode, everything.light.kind) == ("hard", "distant")
+    assert (everything.light.inter_reflection, everything.light.kind) == ("hard", "distant")
     assert Plan.begin(parse_effects("as-set"), config).config == config
     free = tiny_config()
     assert (
@@ -256,7 +256,7 @@ def test_names_switch_settings():
         == Plan.begin(parse_effects("auto"), free).config
         == free
     )
-    assert Plan.begin(parse_effects("none,+inter-reflection"), none).config.inter_reflection.mode == "hard"
+    assert Plan.begin(parse_effects("none,+inter-reflection"), none).config.light.inter_reflection == "hard"
 
 
 @pytest.mark.parametrize(

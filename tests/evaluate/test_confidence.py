@@ -51,7 +51,7 @@ def make_run(capture: Capture, mode: str = "soft") -> Run:
     """An untrained run."""
     torch.manual_seed(0)
     config = tiny_config()
-    config = replace(config, inter_reflection=replace(config.inter_reflection, mode=mode))
+    config = replace(config, light=replace(config.light, inter_reflection=mode))
     model = NeilfModel(Ball(), config, SceneFacts("linear", 0.3, 3.0, "none")).eval()
     return Run(Path("run"), config, capture, model.facts, model, 12)
 

@@ -45,10 +45,10 @@ class Ball(torch.nn.Module):
 
 def make_run(folder: Path, kind: str, step: int = 12, radius: float = RADIUS) -> Run:
     config = tiny_config()
+    light = config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=9)
     config = dataclasses.replace(
         config,
-        light=config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=9),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
+        light=dataclasses.replace(light, inter_reflection="off"),
     )
     torch.manual_seed(0)
     model = NeilfModel(Ball(radius), config, SceneFacts("linear", 0.2, 3.0, "constant")).eval()

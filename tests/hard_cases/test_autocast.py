@@ -39,7 +39,7 @@ HOSTS: Mapping[str, Callable[[NeilfConfig], Any]] = {
 }
 LIGHTS: Mapping[str, NeilfConfig] = {
     "field, L_ref": tiny_config(),
-    "field, traced": changed(tiny_config(), {"inter_reflection.mode": "hard"}),
+    "field, traced": changed(tiny_config(), {"light.inter_reflection": "hard"}),
     "map, traced": solved_light(tiny_config()),
 }
 

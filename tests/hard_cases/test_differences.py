@@ -62,7 +62,7 @@ def small_config(light: str, mode: str = "off") -> NeilfConfig:
             config.loss, position_gradient=1.0, normal_gradient=1.0, hessian=0.0, hessian_joint=0.0
         ),
         volume=dataclasses.replace(config.volume, normal_radius=0.0),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode=mode),
+        light=dataclasses.replace(config.light, inter_reflection=mode),
         shading=dataclasses.replace(config.shading, hit_share=0.3),
     )
 

@@ -82,6 +82,7 @@ def settings(steps: int, known_map: Path | None, samples: int) -> NeilfConfig:
         kind="distant",
         environment_height=8,
         fit=fit,
+        inter_reflection="off",
         map=None if known_map is None else str(known_map),
     )
     return dataclasses.replace(
@@ -89,7 +90,6 @@ def settings(steps: int, known_map: Path | None, samples: int) -> NeilfConfig:
         light=light,
         brdf=dataclasses.replace(config.brdf, width=32),
         shading=dataclasses.replace(config.shading, train_samples=samples, eval_samples=256),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
         loss=dataclasses.replace(config.loss, smoothness=0.0, lambertian=0.0),
         optimizer=dataclasses.replace(config.optimizer, brdf=1e-2),
         train=dataclasses.replace(config.train, sdf_steps=0, material_steps=steps, joint_steps=0),
@@ -145,7 +145,7 @@ def learn(
     median = float(np.median(unit * pixels.color))
     config = settings_of_paper_ngp(steps, mesh) if paper else settings(steps, known_map, samples)
     if mesh and not paper:
-        config = changed(config, {"inter_reflection.mode": "hard"})
+        config = changed(config, {"light.inter_reflection": "hard"})
     host = ball_mesh(median, small_paper_ngp() if paper else tiny_config()) if mesh else closed_form_host
     neilf = attach_neilf(host, config, response=response, median_radiance=median)
     optimizer = torch.optim.Adam(neilf.param_groups())

@@ -46,7 +46,7 @@ def test_every_stage_stays_finite(batch, beta, background, mode):
         config,
         volume=dataclasses.replace(config.volume, beta_init=beta),
         shading=dataclasses.replace(config.shading, hit_share=1e-3),  # every ray with any weight is shaded
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode=mode),
+        light=dataclasses.replace(config.light, inter_reflection=mode),
     )
     model = sphere_model(config, background=background)
     for stage in Stage:

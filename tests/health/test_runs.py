@@ -106,7 +106,7 @@ def test_a_strict_command_ends_with_status_1_if_the_surface_stays_soft_and_keeps
 def test_a_light_that_is_far_too_dim_is_worse_than_one_color(capture, tmp_path):
     """One colour has 13.1 dB, the rendering 15.2 dB with a bright light and 5.4 dB with a hundredth of it."""
     quick = {"optimizer.brdf": 0.1, "train.sdf_steps": 2, "train.material_steps": 30, "train.joint_steps": 0}
-    known = {"light.kind": "distant", "inter_reflection.mode": "off"}
+    known = {"light.kind": "distant", "light.inter_reflection": "off"}
     config = changed(solved_light(tiny_config()), {**quick, **known})
     for radiance, status in ((3.0, 0), (0.03, 1)):
         sky, out = tmp_path / f"{radiance}.exr", tmp_path / f"{radiance}"

@@ -140,7 +140,7 @@ def test_a_near_plane_is_warned_about_if_the_host_renders_rays_between_surfaces(
     assert said["true"] == said["proxy"] == []
     (message,) = said["near"]
     assert "100% of its hits are lost when seen from 0.05 away" in message
-    assert "set inter_reflection.mode to 'hard'" in message
+    assert "set light.inter_reflection to 'hard'" in message
 
 
 def test_the_check_from_another_viewpoint_keeps_the_random_state():

@@ -230,9 +230,7 @@ def two_planes() -> trimesh.Trimesh:
 
 
 def with_rays_per_point(count: float) -> NeilfConfig:
-    return mesh_config(
-        inter_reflection=dataclasses.replace(mesh_config().inter_reflection, rays_per_point=count)
-    )
+    return mesh_config(light=dataclasses.replace(mesh_config().light, rays_per_point=count))
 
 
 def test_light_between_two_planes_is_their_emission():

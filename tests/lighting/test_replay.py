@@ -27,12 +27,10 @@ def short(monkeypatch):
 
 
 def model(**changes) -> NeilfModel:
-    off = dataclasses.replace(tiny_config().inter_reflection, mode="off")
+    off = dataclasses.replace(tiny_config().light, inter_reflection="off")
     # The weights along a ray of the initial sphere are spread out, because its layer is soft.
     soft = dataclasses.replace(tiny_config().shading, hit_share=0.5)
-    return sphere_model(
-        tiny_config(train=dataclasses.replace(QUARTER, **changes), inter_reflection=off, shading=soft)
-    )
+    return sphere_model(tiny_config(train=dataclasses.replace(QUARTER, **changes), light=off, shading=soft))
 
 
 def filled(**changes) -> NeilfModel:

@@ -58,7 +58,6 @@ def solved_light(config: NeilfConfig) -> NeilfConfig:
     return dataclasses.replace(
         config,
         light=dataclasses.replace(fast.light, environment_height=4, fit=fit),
-        inter_reflection=fast.inter_reflection,
     )
 
 

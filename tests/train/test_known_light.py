@@ -30,8 +30,7 @@ def mapped_config() -> NeilfConfig:
     fit = LightFitConfig(points=60, every=2)
     return dataclasses.replace(
         config,
-        light=MapLightConfig(kind="auto", environment_height=6, fit=fit),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
+        light=MapLightConfig(kind="auto", environment_height=6, fit=fit, inter_reflection="off"),
     )
 
 

@@ -357,7 +357,7 @@ def test_decisions_by_evidence_are_read_from_the_run(tmp_path, capture, monkeypa
     decided = [entry for entry in records[0]["decisions"] if entry["effect"] == "inter-reflection"]
     assert [entry["step"] for entry in decided] == [4, 8]
     loaded = load_run(tmp_path / "run")
-    assert (loaded.config.inter_reflection.mode == "off") == (not decided[-1]["on"])
+    assert (loaded.config.light.inter_reflection == "off") == (not decided[-1]["on"])
     assert loaded.model.config == loaded.config
     with pytest.raises(UserError, match="its effects are 'auto'"):
         run(None, tmp_path / "run", resume=True, effects=parse_effects("none"))

@@ -61,7 +61,7 @@ def blocked_share(
     """The occluded share of the hemisphere of each point. Arguments as in `self_visibility`."""
     drawn = cosine(normal).draw(DIRECTIONS, True)
     host, hit_share = model.host, model.config.shading.hit_share
-    if settings.inter_reflection.mode == "hard":
+    if settings.light.inter_reflection == "hard":
         hit = scene_tracer(host, settings.ray_offset, hit_share)(position, drawn).hit
     else:
         start = position.repeat_interleave(DIRECTIONS, 0)

@@ -56,10 +56,10 @@ def ball_run(
 ) -> Run:
     """An untrained run. Its light is a map of 9×18 texels, one of which is bright, and two lamps."""
     config = tiny_config()
+    light = config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=9)
     config = dataclasses.replace(
         config,
-        light=config.light if kind == "free" else MapLightConfig(kind=kind, environment_height=9),
-        inter_reflection=dataclasses.replace(config.inter_reflection, mode="off"),
+        light=dataclasses.replace(light, inter_reflection="off"),
         shading=dataclasses.replace(config.shading, lobe=lobe),
     )
     torch.manual_seed(0)
