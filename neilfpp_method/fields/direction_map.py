@@ -21,6 +21,7 @@ __all__ = [
     "directions_within",
     "grid_position",
     "interpolate",
+    "interpolation",
     "map_directions",
     "row_solid_angles",
     "texel_at",
@@ -42,6 +43,20 @@ def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> F
     closed = closed_in_azimuth(values)
     at = grid_position(*_columns_and_rows(wi, height, width), height, width).to(closed.dtype)
     return functional.grid_sample(closed[None], at[None], align_corners=True)[0].permute(1, 2, 0)
+
+
+def interpolation(
+    wi: Float[Tensor, "N S 3"], height: int, width: int
+) -> tuple[Int[Tensor, "4 N S"], Float[Tensor, "4 N S"]]:
+    """The four texels, row by row, between which `interpolate` interpolates, and their weights."""
+    column, row = _columns_and_rows(wi, height, width)
+    left, top = column.floor(), row.floor().clamp(0, max(height - 2, 0))
+    across, down = column - left, row - top
+    columns = torch.stack((left.long() % width, (left.long() + 1) % width))
+    rows = torch.stack((top.long(), (top.long() + 1).clamp_max(height - 1)))
+    texel = rows[:, None] * width + columns[None]
+    weight = torch.stack((1 - down, down))[:, None] * torch.stack((1 - across, across))[None]
+    return texel.flatten(0, 1), weight.flatten(0, 1)
 
 
 def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor, "*B"]:

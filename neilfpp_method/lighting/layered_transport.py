@@ -165,11 +165,11 @@ def _texel_layers(
     )
     for span in spans(len(shared.observed), texels):
         observed = shared.observed[span]
-        drawn = rays[shared.point[span]].redrawn(environment, observed)
-        layers = []
+        drawn = rays[shared.point[span]].redrawn(environment, observed.position)
+        weight, layers = drawn.weight(observed.normal), []
         for number, value in enumerate(roughnesses):
             roughness = torch.full_like(observed.position[:, :1], value)
-            kernel = brdf_kernel(observed, roughness, drawn.wi, drawn.weight, lobe)
+            kernel = brdf_kernel(observed, roughness, drawn.wi, weight, lobe)
             layers.append(drawn.transport(kernel if number == 0 else kernel[1:]))
         yield Transport(
             torch.cat([layer.sources.half() for layer in layers]),
