@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import shlex
 import sys
-import time
 from dataclasses import dataclass
 
 import torch
@@ -29,8 +28,6 @@ from neilfpp_method.schedule import Stage
 from neilfpp_method.settings.presets import preset
 
 REPETITIONS = 20
-WARM_UP = 3.0
-"""Time for the steps of a material stage before the first measured one, in seconds."""
 PIXELS = 16_384
 """Number of pixels in the measurement of rendering."""
 
@@ -50,9 +47,6 @@ class Options:
 def measured(model: NeilfModel, stage: Stage, rays: int) -> dict[str, float]:
     """Milliseconds, kernels, milliseconds of computation, and peak MiB of a step."""
     step = step_of(model, stage, rays)
-    end = time.monotonic() + WARM_UP
-    while stage is not Stage.SDF_INIT and model.replay.share > model.replay.fresh and time.monotonic() < end:
-        step()
     (seconds,) = median_seconds(step, repetitions=REPETITIONS)
     torch.cuda.reset_peak_memory_stats()
     with profile(activities=[ProfilerActivity.CUDA]) as profiled:

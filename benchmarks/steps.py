@@ -85,14 +85,6 @@ def step_of(model: NeilfModel, stage: Stage, rays: int = RAYS) -> Callable[[], N
     return step
 
 
-def warm_up(model: NeilfModel, step: Callable[[], None]) -> None:
-    """Run steps of a material stage until the replay buffer is full and the number of rendered rays is
-    constant.
-    """
-    while model.replay.share > model.replay.fresh:
-        step()
-
-
 def peak_mebibytes(name: str) -> float:
     """Peak memory that a joint step of a model adds to the process, MiB. Only Linux reports it."""
     step = step_of(model_of(name), Stage.JOINT)
@@ -114,8 +106,6 @@ def measurements() -> Iterator[Measurement]:
         model = model_of(name)
         for stage in Stage:
             step = step_of(model, stage)
-            if stage is Stage.MATERIAL_INIT:
-                warm_up(model, step)
             taken = in_yardsticks(step, REPETITIONS)
             yield Measurement(f"step/{name}/{stage.value}", taken, "yardsticks", "lower", tolerance=0.5)
         model.eval()

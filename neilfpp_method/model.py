@@ -25,7 +25,6 @@ from neilfpp_method.fields import (
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
 from neilfpp_method.incident import Sources, arriving, incident_radiance, scene_tracer, trace_light
-from neilfpp_method.lighting.replay import PointReplay
 from neilfpp_method.lighting.solver import LightSolver, make_light_solver
 from neilfpp_method.schedule import BORROWED_HOST, STAGES, Stage, StagePlan, StageTable, active_losses
 from neilfpp_method.settings.check import check_config
@@ -79,7 +78,6 @@ class NeilfModel(nn.Module):
         lobe: distribution of the specular reflection; None for Lambertian surfaces.
         stages: stage table for this kind of host: active losses and trained fields of each stage.
         units: units in which the losses measure radiance.
-        replay: surface points of earlier steps, reused in stages in which no surface moves.
         check_outputs: rejects host outputs that break the contract.
         observers: callbacks that get the batch and the host's hits of every training step, before shading.
 
@@ -111,9 +109,6 @@ class NeilfModel(nn.Module):
         parts = make_light(config, facts.response, facts.median_radiance / albedo)
         self.light, self.lamps = parts.light, parts.lamps
         self.use(config)
-        # The trainer of a borrowed host may move its surface in any step, so no point is reused.
-        surface_is_fixed = not borrowed and not self.stages[Stage.MATERIAL_INIT].trains_host
-        self.replay = PointReplay(config.train.fresh if surface_is_fixed else 1.0, config.train.rays)
 
     def use(self, config: NeilfConfig) -> None:
         """Switch to other settings. Effects may change; the sizes of the fields must not."""
@@ -157,10 +152,6 @@ class NeilfModel(nn.Module):
         plan, active = self.stages[stage], active_losses(stage, self.config, self.stages)
         if not active:
             return StepResult.of({}, SurfacePixels.empty_like(batch), batch[:0])
-        reuses_points = self.training and not plan.trains_host
-        if reuses_points:
-            rows = self.replay.rows_to_render(len(batch))
-            batch, hits = batch[rows], None if hits is None else hits[rows]
 
         # 1. Geometry G and outgoing radiance R: render colour, hit position and normal of each camera ray.
         hits, terms = self._render_host(batch, plan, active, hits)
@@ -173,8 +164,7 @@ class NeilfModel(nn.Module):
         batch = self._at_mean_exposure(batch)
         is_surface = hits.is_hit(self.config.shading.hit_share) & (batch.mask > 0.5)
         rows = torch.nonzero(is_surface)[:, 0]
-        rendered = self._surface_pixels(hits[rows], batch[rows])
-        surface = self.replay.with_earlier(rendered) if reuses_points else rendered
+        surface = self._surface_pixels(hits[rows], batch[rows])
         position, normal, wo = surface.position, surface.normal, surface.wo
 
         # 3. Material: query the BRDF field B at the surface points.
@@ -194,7 +184,7 @@ class NeilfModel(nn.Module):
         # 6. Inter-reflection: where a ray along wi hits the scene again, L here must equal R there.
         if "inter_reflection" in active:
             terms["inter_reflection"] = self._inter_reflection(position, normal)
-        return StepResult.of(terms, rendered, self._background_pixels(batch, hits))
+        return StepResult.of(terms, surface, self._background_pixels(batch, hits))
 
     @timed("rendering")
     def _render_host(

@@ -45,9 +45,9 @@ def count_queries(model, run) -> Counter:
 
 
 def _counted(function, counts, name):
-    def call(first, *rest):
+    def call(first, *rest, **options):
         counts[name] += len(rest[0].flatten(0, -2)) if name == "light" else len(first)
-        return function(first, *rest)
+        return function(first, *rest, **options)
 
     return call
 

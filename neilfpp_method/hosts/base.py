@@ -77,7 +77,10 @@ class Regularized(Protocol):
     """A host with losses of its own. Without it only the losses of the method train the geometry."""
 
     def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
-        """As `render`, with those of the named losses that the host has; others are not computed."""
+        """As `render`, with those of the named losses that the host has; others are not computed.
+
+        Without "volume" among the names no step reads the colours, and they may be 0.
+        """
         ...
 
 

@@ -133,9 +133,9 @@ class VolSdfHost(nn.Module):
 
     def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
         """As `render`, with those of the losses eikonal, hessian, surface, point_cloud, mask and patches
-        in `names`.
+        in `names`. Without "volume" among them, colours are not evaluated, and are 0.
         """
-        march = self._march(batch.rays)
+        march = self._march(batch.rays, colored="volume" in names)
         if march.surface.distance.requires_grad:
             if self.grid_age is not None:
                 self.grid_age += 1
@@ -282,8 +282,8 @@ class VolSdfHost(nn.Module):
         visible = self._march(rays[rows], part).hits
         return missed.map_named(lambda name, values: values.index_put((rows,), getattr(visible, name)))
 
-    def _march(self, rays: RayBatch, part: Interval | None = None) -> March:
-        """Sample and blend rays; `part` is the part of each ray to sample, if it is known."""
+    def _march(self, rays: RayBatch, part: Interval | None = None, colored: bool = True) -> March:
+        """Sample and blend rays, in `part` of each if it is known; colours are 0 unless `colored`."""
         interval = part or sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
         narrowed = part is not None
         if self.empty_space is not None and self.training:
@@ -300,9 +300,12 @@ class VolSdfHost(nn.Module):
             self._evaluation_space = None
         weights = depth_weights(self.density(surface.distance.reshape(distances.shape), distances))
         normals = safe_normalize(surface.gradient)
-        wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
-        radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
-        hits = self._blend(rays, distances, weights, normals.view_as(points), radiance.view_as(points))
+        radiance = None
+        if colored:
+            wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
+            radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
+            radiance = radiance.view_as(points)
+        hits = self._blend(rays, distances, weights, normals.view_as(points), radiance)
         return March(distances, surface, hits)
 
     def _sample(self, rays: RayBatch, interval: Interval, counts: SampleCounts) -> Float[Tensor, "N M"]:
@@ -315,15 +318,18 @@ class VolSdfHost(nn.Module):
         distances: Float[Tensor, "N M"],
         intervals: Weights,
         normals: Float[Tensor, "N M 3"],
-        radiance: Float[Tensor, "N M 3"],
+        radiance: Float[Tensor, "N M 3"] | None,
     ) -> SurfaceHits:
         weights, opacity = sample_weights(intervals.weights), intervals.opacity
         # The position of a ray without weight is its last sample: finite, and far from every surface.
         depth = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
         depth = depth / (opacity + SPARE_WEIGHT)
+        color = torch.zeros_like(rays.origins)
+        if radiance is not None:
+            color = composite(weights, radiance)
+            color = color + self._background(rays, intervals.transmittance, radiance[:, -1])
         return SurfaceHits(
-            color=composite(weights, radiance)
-            + self._background(rays, intervals.transmittance, radiance[:, -1]),
+            color=color,
             position=rays.origins + depth[:, None] * rays.directions,
             normal=safe_normalize(composite(weights, normals)),
             opacity=opacity,

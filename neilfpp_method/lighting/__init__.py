@@ -6,6 +6,5 @@ The outgoing radiance of a surface is linear in the texels of the map and in the
 (`sky`), and lets `solve` find the light. `solve` computes the transport to the points (`fit_points`,
 `map_transport`, `lamp_transport`), minimises the terms of `objective` (`fit`, `descent`), and chooses lamps
 (`candidates`, `settle`) if held-back points favour them (`decision`). `layered_transport` has the transport
-at several roughnesses, from which `effects` finds materials. `replay` shades the surface points of earlier
-steps again.
+at several roughnesses, from which `effects` finds materials.
 """

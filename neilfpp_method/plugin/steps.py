@@ -136,7 +136,7 @@ class Steps:
     def compute(self, pixels: PixelBatch) -> LossTerms:
         """The loss terms of a step, before their weights."""
         position = self.position
-        self._moment = Moment.before_step(self.neilf, pixels, position, self.number)
+        self._moment = Moment.before_step(pixels, position, self.number)
         self._computed = self.neilf.step(pixels, position.stage)
         return self._computed.terms
 

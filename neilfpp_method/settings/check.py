@@ -32,8 +32,6 @@ def check_config(config: NeilfConfig) -> None:
         UserError: a value is out of range.
     """
     _check_ranges(config)
-    if not 0 < config.train.fresh <= 1:
-        raise UserError(f"--config.train.fresh is {config.train.fresh}", "set it above 0 and at most to 1")
     if config.volume.beta_final < 0:
         raise UserError(
             f"--config.volume.beta-final is {config.volume.beta_final}", "set it to 0 (no bound) or more"

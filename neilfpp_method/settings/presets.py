@@ -165,7 +165,6 @@ FAST: Mapping[str, Any] = {
     "train.material_steps": 3_000,
     "train.joint_steps": 300,
     "train.rays": 512,
-    "train.fresh": 0.25,
 }
 
 

@@ -345,8 +345,6 @@ class TrainConfig:
     """Times that camera poses are fitted to the photographs in SDF init. 0: poses are as given."""
     rays: int = 4096
     """Rays per step and process."""
-    fresh: float = 1.0
-    """Share of a step's rays that are rendered while geometry is fixed; stored points replace the others."""
     seed: int = 0
     """Seed. The random numbers of step k depend only on the seed and k."""
     checkpoint_every: int = 500

@@ -165,7 +165,7 @@ def _train_step(
         with timed("data"):
             # Only the smoothness loss reads image gradients.
             batch = run.pixels.sample(settings.rays, gradients="smoothness" in weights)
-        moment = Moment.before_step(model, batch, at, step)
+        moment = Moment.before_step(batch, at, step)
         computed = wrapped(batch, at.stage)
         total = weigh(computed.terms, weights)
         stop = _update(run, optimizer, computed.terms, total, moment)

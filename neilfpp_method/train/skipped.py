@@ -40,26 +40,17 @@ class Moment:
         position: the stage and the position within it.
         step: number of the step, counted over all stages.
         random: state of torch's random number generator on the CPU.
-        replay: state of the replay buffer (`lighting.replay`), which the step changes.
     """
 
     batch: PixelBatch
     position: StagePosition
     step: int
     random: Tensor
-    replay: dict[str, Any]
 
     @staticmethod
-    def before_step(model: NeilfModel, batch: PixelBatch, position: StagePosition, step: int) -> Moment:
-        """Record the state after the pixels of a step are drawn.
-
-        The replay buffer, some hundred kilobytes, is copied if the step uses it.
-        """
-        replay = {}
-        if not model.stages[position.stage].trains_host:
-            state = model.replay.state_dict(prefix="replay.")
-            replay = {name: v.clone() if isinstance(v, Tensor) else dict(v) for name, v in state.items()}
-        return Moment(batch, position, step, torch.get_rng_state(), replay)
+    def before_step(batch: PixelBatch, position: StagePosition, step: int) -> Moment:
+        """Record the state after the pixels of a step are drawn."""
+        return Moment(batch, position, step, torch.get_rng_state())
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,7 @@ def keep_step(run: Path, model: NeilfModel, moment: Moment) -> Path | None:
         "stage": moment.position.stage.value,
         "share": moment.position.share,
         "batch": {f.name: getattr(moment.batch, f.name).cpu() for f in dataclasses.fields(PixelBatch)},
-        "model": {**model.state_dict(), **moment.replay},
+        "model": model.state_dict(),
         "random": moment.random,
     }
     path = folder / f"{moment.step}.pt"

@@ -126,6 +126,18 @@ def test_only_the_named_losses_are_computed(sharp):
     assert sharp.render_regularized(batch, []).terms == {}
 
 
+def test_r_is_not_evaluated_without_l_vol(monkeypatch):
+    host, batch = sphere_model().host, sphere_batch()
+    torch.manual_seed(0)
+    whole = host.render_regularized(batch, ["volume"]).hits
+    monkeypatch.setattr(host, "radiance_field", None)
+    torch.manual_seed(0)
+    hits = host.render_regularized(batch, ["eikonal"]).hits
+    assert not hits.color.any()
+    for name in ("position", "normal", "opacity", "concentration"):
+        torch.testing.assert_close(getattr(hits, name), getattr(whole, name))
+
+
 def test_regularizers_cover_the_whole_scene():
     """For G = c · x the losses are known at every point, so their means and counts show which points are
     used.

@@ -19,8 +19,6 @@ def with_setting(config: NeilfConfig, room: str, **settings: object) -> NeilfCon
 
 
 WRONG = {
-    "no rays are fresh": (preset("fast"), "train", {"fresh": 0.0}, "train.fresh is 0"),
-    "more than all are fresh": (preset("fast"), "train", {"fresh": 1.5}, "train.fresh is 1.5"),
     "a surface of negative width": (preset("fast"), "volume", {"beta_final": -0.1}, "beta-final is -0.1"),
     "no incident directions": (
         preset("fast"),
@@ -71,6 +69,6 @@ def test_presets_and_their_variants_are_accepted(name):
 
 
 def test_attaching_checks_the_settings():
-    config = with_setting(tiny_config(), "train", fresh=2.0)
-    with pytest.raises(UserError, match="fresh is 2"):
+    config = with_setting(tiny_config(), "train", rays=0)
+    with pytest.raises(UserError, match="rays is 0"):
         attach_neilf(lambda origins, directions: (origins, origins, origins), config=config)

@@ -26,9 +26,8 @@ from tests.train.small_runs import small_config, small_training
 
 @pytest.fixture
 def training(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> Training:
-    """A run on disk with four steps per stage, whose material stage shades points of earlier steps again."""
-    monkeypatch.setattr("neilfpp_method.lighting.replay.KEPT_STEPS", 1)
-    config = small_config(fresh=0.5)
+    """A run on disk with four steps per stage."""
+    config = small_config()
     made = small_training(capture, tmp_path / "run", config)
     create_run(made.path, config, CaptureSource(str(capture)), made.model.facts)
     return made
@@ -118,7 +117,6 @@ def test_a_rerun_repeats_the_step_bit_for_bit(training, monkeypatch):
     found = rerun_step(training.path, 6)
     assert found.finite
     assert "finite now" in rerun_summary(found)
-    assert training.model.replay.ring.full  # points of earlier steps were shaded
     assert values[6].keys() == again[0].keys()
     for name, value in values[6].items():
         assert torch.equal(value, again[0][name]), name
