@@ -17,7 +17,6 @@ from torch import Tensor
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
-from neilfpp_method.kernels.products import times_channels
 from neilfpp_method.lighting.lamp_transport import in_sight, lamp_kernel
 from neilfpp_method.lighting.map_transport import TexelRays, trace_texels
 from neilfpp_method.lighting.transport import Transport, brdf_kernel, spans
@@ -81,7 +80,11 @@ def texel_layers(
     Returns:
         The transport in layers; `sources` has half precision.
     """
-    return Transport.joined(list(_texel_layers(environment, shared, roughnesses, lobe, scene)))
+    parts = []
+    for rays, kernel in _kernels(environment, shared, roughnesses, lobe, scene):
+        part = rays.within_texels(kernel)
+        parts.append(Transport(part.sources.half(), part.scene))
+    return Transport.joined(parts)
 
 
 @torch.no_grad()
@@ -97,13 +100,12 @@ def light_layers(
     No transport matrix is stored, so that the map may have any size. Arguments as in `texel_layers`.
     """
     environment, lamps = light.light, light.lamps
-    radiance = environment.log_radiance.exp().flatten(1).t()
-    spans_of_pixels = [
-        LightLayers(times_channels(part.sources.float(), radiance), part.scene)
-        for part in _texel_layers(environment, shared, roughnesses, lobe, scene)
+    parts = [
+        LightLayers(rays.from_map(kernel, environment), rays.from_scene(kernel))
+        for rays, kernel in _kernels(environment, shared, roughnesses, lobe, scene)
     ]
-    from_light = torch.cat([layers.light for layers in spans_of_pixels], 1)
-    from_scene = torch.cat([layers.scene for layers in spans_of_pixels], 1)
+    from_light = torch.cat([part.light for part in parts], 1)
+    from_scene = torch.cat([part.scene for part in parts], 1)
     if lamps.count:
         sight = in_sight(lamps.lit_places, lamps.radius, shared.position, scene)[shared.point]
         from_light += lamp_layers(lamps, sight, shared.observed, roughnesses, lobe)
@@ -148,14 +150,14 @@ def layers_at(layers: Tensor, number: Int[Tensor, " N"]) -> Tensor:
     return layers[torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number)), rows]
 
 
-def _texel_layers(
+def _kernels(
     environment: EnvironmentLight,
     shared: SharedPoints,
     roughnesses: Sequence[float],
     lobe: Lobe,
     scene: SceneTracer | None,
-) -> Iterator[Transport]:
-    """The result of `texel_layers` for consecutive spans of pixels."""
+) -> Iterator[tuple[TexelRays, Float[Tensor, "K N S"]]]:
+    """For consecutive spans of pixels, their rays and the layers of the BRDF times the rays' weights."""
     texels = environment.log_radiance[0].numel()
     rays = TexelRays.joined(
         [
@@ -170,8 +172,5 @@ def _texel_layers(
         for number, value in enumerate(roughnesses):
             roughness = torch.full_like(observed.position[:, :1], value)
             kernel = brdf_kernel(observed, roughness, drawn.wi, weight, lobe)
-            layers.append(drawn.transport(kernel if number == 0 else kernel[1:]))
-        yield Transport(
-            torch.cat([layer.sources.half() for layer in layers]),
-            torch.cat([layer.scene for layer in layers]),
-        )
+            layers.append(kernel if number == 0 else kernel[1:])
+        yield drawn, torch.cat(layers)

@@ -54,7 +54,7 @@ def from_texels(
             in_lobe = specular_lobe(part.normal, part.wo, roughness[span], lobe)
             rays = rays.with_technique(in_lobe, LOBE_RAYS, part.position, scene)
         kernel = brdf_kernel(part, roughness[span], rays.wi, rays.weight(part.normal), lobe)
-        parts.append(rays.transport(kernel))
+        parts.append(rays.between_texels(kernel))
     return Transport.joined(parts)
 
 
@@ -124,16 +124,38 @@ class TexelRays:
         """Cosine about the normals of the points, divided by the density."""
         return dot(self.wi, normal).clamp_min(0) / self.density
 
-    def transport(self, kernel: Float[Tensor, "K N S"]) -> Transport:
-        """The transport through a kernel, which is the BRDF times `weight`."""
-        from_scene = kernel.new_zeros(*kernel.shape[:2], 3)
-        if self.scene_light is not None:
-            from_scene = torch.einsum("kns,nsc->knc", kernel, self.scene_light.radiance.to(kernel.dtype))
-            kernel = kernel * ~self.scene_light.hit
-        sources = kernel.new_zeros(*kernel.shape[:2], self.size[0] * self.size[1])
+    def between_texels(self, kernel: Float[Tensor, "K N S"]) -> Transport:
+        """The transport through a kernel, which is the BRDF times `weight`; radiance is interpolated."""
+        sources, free = self._no_sources(kernel), self._unblocked(kernel)
         for texel, weight in zip(*interpolation(self.wi, *self.size), strict=True):
-            sources.scatter_add_(2, texel.expand(len(kernel), -1, -1), kernel * weight)
-        return Transport(sources, from_scene)
+            sources.scatter_add_(2, texel.expand(len(kernel), -1, -1), free * weight)
+        return Transport(sources, self.from_scene(kernel))
+
+    def within_texels(self, kernel: Float[Tensor, "K N S"]) -> Transport:
+        """As `between_texels`, with the same radiance in all of a texel; for one ray in each texel."""
+        texel = self.texel.expand(len(kernel), -1, -1)
+        sources = self._no_sources(kernel).scatter_(2, texel, self._unblocked(kernel))
+        return Transport(sources, self.from_scene(kernel))
+
+    def from_map(
+        self, kernel: Float[Tensor, "K N S"], environment: EnvironmentLight
+    ) -> Float[Tensor, "K N 3"]:
+        """Outgoing radiance due to the map, through a kernel."""
+        radiance = environment.radiance(self.wi[:, 0], self.wi)
+        return torch.einsum("kns,nsc->knc", self._unblocked(kernel), radiance)
+
+    def from_scene(self, kernel: Float[Tensor, "K N S"]) -> Float[Tensor, "K N 3"]:
+        """Outgoing radiance due to the surfaces that the rays meet, through a kernel."""
+        if self.scene_light is None:
+            return kernel.new_zeros(*kernel.shape[:2], 3)
+        return torch.einsum("kns,nsc->knc", kernel, self.scene_light.radiance.to(kernel.dtype))
+
+    def _unblocked(self, kernel: Float[Tensor, "K N S"]) -> Float[Tensor, "K N S"]:
+        """The kernel with 0 where the scene blocks the map."""
+        return kernel if self.scene_light is None else kernel * ~self.scene_light.hit
+
+    def _no_sources(self, kernel: Float[Tensor, "K N S"]) -> Float[Tensor, "K N T"]:
+        return kernel.new_zeros(*kernel.shape[:2], self.size[0] * self.size[1])
 
 
 def trace_texels(

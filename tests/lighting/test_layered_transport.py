@@ -38,21 +38,21 @@ def test_the_layers_of_a_map_agree_with_each_roughness_alone():
         torch.testing.assert_close(found.sum(-1), alone.sum(-1), rtol=0.05, atol=5e-3)
 
 
-def test_the_layers_of_a_light_are_those_of_its_map_times_its_radiance_and_those_of_its_lamps():
-    environment, lamps, shared = EnvironmentLight(48, 1.0), Lamps(2, 0.06), shared_points()
-    environment.show(torch.rand(3, 48, 96) + 0.1)
+def test_the_layers_of_a_light_agree_with_each_roughness_alone():
+    """Radiance is interpolated between the texels of the map, which differ by a factor of up to ten."""
+    environment, lamps, shared = EnvironmentLight(24, 1.0), Lamps(2, 0.06), shared_points()
+    torch.manual_seed(0)
+    environment.show(torch.rand(3, 24, 48) + 0.1)
     lamps.place(torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 5.0))
-    torch.manual_seed(0)
-    found = light_layers(LightModel(environment, lamps), shared, ROUGHNESSES, GGX, half_room)
-    torch.manual_seed(0)
-    transport = texel_layers(environment, shared, ROUGHNESSES, GGX, half_room)
+    light = LightModel(environment, lamps)
+    draws = [light_layers(light, shared, ROUGHNESSES, GGX, half_room) for _ in range(64)]
+    found = torch.stack([drawn.light + drawn.scene for drawn in draws]).mean(0)
     radiance = environment.log_radiance.exp().flatten(1).t()
-    expected = transport.sources.float() @ radiance + transport.scene
     for number, value in enumerate(ROUGHNESSES):
         roughness = torch.full((PIXELS, 1), value)
+        alone = [from_texels(environment, shared.observed, roughness, GGX, half_room) for _ in range(16)]
         lit = from_lamps(lamps.lit_places, lamps.radius, shared.observed, roughness, GGX, half_room).sources
-        sent = lit @ lamps.lit_intensity
-        expected[1 + 2 * number : 3 + 2 * number] += sent[1:]
-        expected[0] += sent[0] if number == 0 else 0
-    torch.testing.assert_close(found.light + found.scene, expected, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(found.scene, transport.scene)
+        expected = sum(one.sources @ radiance + one.scene for one in alone) / len(alone)
+        expected = expected + lit @ lamps.lit_intensity
+        layers = layers_at(found, torch.full((PIXELS,), number))
+        torch.testing.assert_close(layers, expected, rtol=0.02, atol=0.01)
