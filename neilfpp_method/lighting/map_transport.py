@@ -141,7 +141,8 @@ class TexelRays:
         self, kernel: Float[Tensor, "K N S"], environment: EnvironmentLight
     ) -> Float[Tensor, "K N 3"]:
         """Outgoing radiance due to the map, through a kernel."""
-        radiance = environment.radiance(self.wi[:, 0], self.wi)
+        anywhere = torch.zeros_like(self.wi[:, 0])  # a map is the same at every point
+        radiance = environment.radiance(anywhere, self.wi)
         return torch.einsum("kns,nsc->knc", self._unblocked(kernel), radiance)
 
     def from_scene(self, kernel: Float[Tensor, "K N S"]) -> Float[Tensor, "K N 3"]:
