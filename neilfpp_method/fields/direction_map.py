@@ -21,7 +21,7 @@ __all__ = [
     "directions_within",
     "grid_position",
     "interpolate",
-    "interpolation",
+    "interpolation_weights",
     "map_directions",
     "row_solid_angles",
     "texel_at",
@@ -45,7 +45,7 @@ def interpolate(values: Float[Tensor, "C H W"], wi: Float[Tensor, "M S 3"]) -> F
     return functional.grid_sample(closed[None], at[None], align_corners=True)[0].permute(1, 2, 0)
 
 
-def interpolation(
+def interpolation_weights(
     wi: Float[Tensor, "N S 3"], height: int, width: int
 ) -> tuple[Int[Tensor, "4 N S"], Float[Tensor, "4 N S"]]:
     """The four texels, row by row, between which `interpolate` interpolates, and their weights."""

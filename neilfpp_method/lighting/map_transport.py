@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from neilfpp_method.fields.direction_map import interpolation, texel_solid_angles, texels_of
+from neilfpp_method.fields.direction_map import interpolation_weights, texel_solid_angles, texels_of
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.transport import Transport, brdf_kernel, spans
 from neilfpp_method.shading.brdf import Lobe
@@ -127,7 +127,7 @@ class TexelRays:
     def between_texels(self, kernel: Float[Tensor, "K N S"]) -> Transport:
         """The transport through a kernel, which is the BRDF times `weight`; radiance is interpolated."""
         sources, free = self._no_sources(kernel), self._unblocked(kernel)
-        for texel, weight in zip(*interpolation(self.wi, *self.size), strict=True):
+        for texel, weight in zip(*interpolation_weights(self.wi, *self.size), strict=True):
             sources.scatter_add_(2, texel.expand(len(kernel), -1, -1), free * weight)
         return Transport(sources, self.from_scene(kernel))
 

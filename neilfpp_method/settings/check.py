@@ -1,6 +1,7 @@
 """Check a configuration before training: values out of range.
 
 Settings that exclude each other cannot be written: each kind of light and of host has settings of its own.
+Python does not check the types and choices of a dataclass, so they are checked here as those of a file are.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import math
 from dataclasses import asdict
 
 from neilfpp_method.errors import UserError
+from neilfpp_method.settings.plain import from_dict, to_dict
 from neilfpp_method.settings.types import NeilfConfig
 
 __all__ = ["check_config"]
@@ -29,8 +31,9 @@ def check_config(config: NeilfConfig) -> None:
     """Reject settings from which no model can be made, in every training loop.
 
     Raises:
-        UserError: a value is out of range.
+        UserError: a value is out of range, has the wrong type, or is not one of the choices.
     """
+    from_dict(NeilfConfig, to_dict(config))
     _check_ranges(config)
     if config.volume.beta_final < 0:
         raise UserError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from neilfpp_method.fields.direction_map import interpolate, interpolation
+from neilfpp_method.fields.direction_map import interpolate, interpolation_weights
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.shading import Sampling, sample_directions, shade
@@ -31,7 +31,7 @@ def test_the_four_texels_give_the_interpolated_value(rows):
     wi = torch.nn.functional.normalize(torch.randn(50, 8, 3, generator=generator), dim=-1)
     wi[0] = torch.tensor([0.0, 0.0, 1.0])
     wi[1] = torch.tensor([0.0, 0.0, -1.0])
-    texel, weight = interpolation(wi, rows, 2 * rows)
+    texel, weight = interpolation_weights(wi, rows, 2 * rows)
     found = (values.flatten(1)[:, texel] * weight).sum(1).permute(1, 2, 0)
     torch.testing.assert_close(found, interpolate(values, wi), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(weight.sum(0), torch.ones(50, 8))

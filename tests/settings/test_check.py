@@ -55,10 +55,17 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_values_out_of_range_are_refused(case):
+def test_impossible_values_are_refused(case):
     config, room, settings, message = WRONG[case]
     with pytest.raises(UserError, match=message):
         check_config(with_setting(config, room, **settings))
+
+
+def test_a_map_that_l_ref_cannot_train_is_refused():
+    config = preset("fast")
+    object.__setattr__(config.light, "inter_reflection", "soft")  # the tests check types, Python does not
+    with pytest.raises(UserError, match="'soft' is not a choice"):
+        check_config(config)
 
 
 @pytest.mark.parametrize("name", PRESETS)
