@@ -37,8 +37,6 @@ EXPLORING_BATCHES, EXPLORING_RAYS = 16, 512
 """Number of batches, and rays per batch, with which `explore` explores the surface."""
 EXPLORING_RADIUS = 0.2
 """Largest offset of the targets of `explore` from known hits, per axis, scene units."""
-START_HEIGHT = 0.75
-"""Height above the grid's surface at which rays start, in cells; tracing ends at a quarter cell."""
 MAX_OVERSHOOT = 2.0
 """A ray that goes this much further than the grid's surface, in cells, shows that points are outdated."""
 MAX_MISS_OPACITY = 0.01
@@ -271,26 +269,19 @@ class SurfaceProxy(nn.Module):
 
     @torch.no_grad()
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
-        """Light from the scene's surfaces (`hosts.base.TracesLight`); none before the first refresh.
-
-        Rays start above the surface of the grid itself, so that its error casts no shadows.
-        """
+        """Light from the scene's surfaces (`hosts.base.TracesLight`); none before the first refresh."""
         directions = wi.reshape(-1, 3)
         surface = self._known_surface()
         if surface is None:
             zeros = torch.zeros_like(wi[..., 0])
             return SceneLight(zeros > 0, torch.zeros_like(wi), torch.full_like(zeros, torch.inf))
-        normal = grid_normal(surface.distance, self.radius, x)
-        height = look_up(surface.distance, self.radius, x)
-        lift = (START_HEIGHT * self.cell - height).clamp(0, (START_HEIGHT + 1) * self.cell)
-        start = (x + lift[:, None] * normal)[:, None].expand_as(wi).reshape(-1, 3)
-        traced = self._trace(RayBatch(start, directions))
+        start = x[:, None].expand_as(wi).reshape(-1, 3)
+        traced = self._trace(RayBatch(start, directions), leaves_surface=True)
         rows = torch.nonzero(traced.hit)[:, 0]
         position = start[rows] + traced.distance[rows, None] * directions[rows]
         radiance = torch.zeros_like(directions)
         radiance[rows] = self._outgoing(position, -directions[rows])
-        distance = torch.full_like(directions[:, 0], torch.inf)
-        distance[rows] = (position - x[rows // wi.shape[1]]).norm(dim=-1)
+        distance = torch.where(traced.hit, traced.distance, torch.inf)
         return SceneLight(traced.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()
@@ -329,12 +320,12 @@ class SurfaceProxy(nn.Module):
             self._surface = self._fused()
         return self._surface
 
-    def _trace(self, rays: RayBatch) -> GridHits:
+    def _trace(self, rays: RayBatch, *, leaves_surface: bool = False) -> GridHits:
         """Trace rays, which may start outside of the cube, to the surface of the grid."""
         grid = self._known_surface().distance
         entry = self._entry(rays)
         start = rays.origins + entry.distance[:, None] * rays.directions
-        traced = trace_grid(grid, self.radius, start, rays.directions)
+        traced = trace_grid(grid, self.radius, start, rays.directions, leaves_surface=leaves_surface)
         hit = traced.hit & entry.passes
         # Tracing ends a quarter cell above the surface; a Newton step covers the rest.
         rows = torch.nonzero(hit)[:, 0]

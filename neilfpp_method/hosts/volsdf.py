@@ -24,7 +24,7 @@ from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayB
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
 from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
-from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, cell_size, sample_grid, trace_grid
+from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from neilfpp_method.volume.intersect import Interval, sphere_interval
@@ -166,15 +166,11 @@ class VolSdfHost(nn.Module):
     def scene_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> SceneLight:
         """Light from the scene's surfaces at surface points: R where rays through a grid of the SDF hit.
 
-        A ray starts one cell of the grid above the surface, along the normal. The grid is sampled at first
-        use, and again after `GRID_LIFE` training steps of the geometry.
+        The grid is sampled at first use, and again after `GRID_LIFE` training steps of the geometry.
         """
-        radius = self.config.volume.radius
-        grid = self._grid()
-        normal = safe_normalize(self.sdf_field.with_gradient(x).gradient)
-        origins = (x + cell_size(grid, radius) * normal)[:, None].expand_as(wi).reshape(-1, 3)
+        origins = x[:, None].expand_as(wi).reshape(-1, 3)
         directions = wi.reshape(-1, 3)
-        traced = trace_grid(grid, radius, origins, directions)
+        traced = trace_grid(self._grid(), self.config.volume.radius, origins, directions, leaves_surface=True)
         rows = torch.nonzero(traced.hit)[:, 0]
         points = origins[rows] + traced.distance[rows, None] * directions[rows]
         surface = self.sdf_field.with_gradient(points)
@@ -182,8 +178,7 @@ class VolSdfHost(nn.Module):
         radiance[rows] = self.radiance_field(
             points, -directions[rows], safe_normalize(surface.gradient), surface.feature
         )
-        distance = torch.full_like(traced.distance, torch.inf)
-        distance[rows] = (points - x[rows // wi.shape[1]]).norm(dim=-1)
+        distance = torch.where(traced.hit, traced.distance, torch.inf)
         return SceneLight(traced.hit.view(wi.shape[:2]), radiance.view(wi.shape), distance.view(wi.shape[:2]))
 
     @torch.no_grad()

@@ -231,24 +231,30 @@ def point_gradient(
 
 
 @compiled
-def sphere_trace(grid, radius, origins, directions, hit_distance, max_steps, distance, hit, start, stop):
-    """Trace the rays in [start, stop) in a grid of distances.
+def sphere_trace(
+    grid, radius, origins, directions, hit_distance, leaves_surface, max_steps, distance, hit, start, stop
+):
+    """Trace the rays in [start, stop) in a grid of distances; see `tracing.sphere_trace`.
 
-    Writes the length of each ray, and whether it came closer to a surface than `hit_distance`.
+    Writes the length of each ray, and whether it hit a surface.
     """
     number = grid.dtype.type
     cells = len(grid) - 1
     edge, reach = number(2 * radius / cells), number(radius)
     for n in range(start, stop):
-        length, is_hit = number(0), False
-        for _ in range(max_steps):
+        length, is_hit, threshold = number(0), False, hit_distance
+        for step in range(max_steps):
             x = origins[n, 0] + length * directions[n, 0]
             y = origins[n, 1] + length * directions[n, 1]
             z = origins[n, 2] + length * directions[n, 2]
             if abs(x) > reach or abs(y) > reach or abs(z) > reach:
                 break
             clearance = _at_vertices(grid, (x + reach) / edge, (y + reach) / edge, (z + reach) / edge, cells)
-            if clearance < hit_distance:
+            if clearance >= hit_distance:
+                threshold = hit_distance
+            elif leaves_surface and step == 0:
+                threshold = min(clearance, number(0)) - hit_distance
+            if clearance < threshold:
                 is_hit = True
                 break
             length += max(clearance, hit_distance)

@@ -24,6 +24,7 @@ def sphere_trace(
     directions: Float[Tensor, "P 3"],
     *,
     hit_distance: float,
+    leaves_surface: bool,
     steps: int,
     distance: Float[Tensor, " P"],
     hit: Bool[Tensor, " P"],
@@ -34,12 +35,16 @@ def sphere_trace(
     `steps` steps or when it leaves the cube [−radius, radius]³. All floating-point tensors have the same
     type.
 
+    A ray that leaves a surface starts closer to it than `hit_distance`, or below it. Until it is clear of the
+    surface, it hits only where it is deeper than its start by `hit_distance`.
+
     Args:
         grid: distances at the vertices z, y, x of the cube.
         radius: half the edge of the cube.
         origins: origins of the rays.
         directions: unit directions of the rays.
         hit_distance: distance below which a surface counts as hit.
+        leaves_surface: whether the rays start at a surface, which they must not hit.
         steps: maximum number of steps.
         distance: receives the length of each ray.
         hit: receives whether each ray has hit a surface.
@@ -48,6 +53,8 @@ def sphere_trace(
     written, closest = (distance.numpy(), hit.numpy()), vertices.dtype.type(hit_distance)
 
     def trace(first: int, last: int) -> None:
-        compiled.sphere_trace(vertices, radius, start, towards, closest, steps, *written, first, last)
+        compiled.sphere_trace(
+            vertices, radius, start, towards, closest, leaves_surface, steps, *written, first, last
+        )
 
     for_each(trace, shares(len(origins), MIN_RAYS_PER_THREAD))

@@ -29,11 +29,13 @@ __all__ = [
 SignedDistance = Callable[[Float[Tensor, "P 3"]], Float[Tensor, " P"]]
 """Signed distance at points of the scene frame, negative inside."""
 
-GRID_RESOLUTION = 96
-"""Vertices along an edge of the grid that hard inter-reflection traces."""
+GRID_RESOLUTION = 160
+"""Vertices along an edge of the grid that hard inter-reflection traces. On a recovered table top, visibility
+is wrong along 1.03, 0.78, 0.70 and 0.63 % of rays (by cosine) with 96, 128, 160 and 256 vertices.
+"""
 CHUNK = 65_536
 """Points per evaluation of the field when a grid is sampled; limits memory."""
-STEPS = 40
+STEPS = 96
 """Maximum number of steps of a ray. A ray that has not ended by then grazes a surface; it counts as a
 miss.
 """
@@ -77,8 +79,15 @@ def trace_grid(
     radius: float,
     origins: Float[Tensor, "P 3"],
     directions: Float[Tensor, "P 3"],
+    *,
+    leaves_surface: bool = False,
 ) -> GridHits:
     """Sphere-trace rays: each step is the interpolated distance, but at least a quarter of a cell.
+
+    Rays from a surface start exactly at their points (`leaves_surface`). If they started above them, along
+    the normal, every shadow would move towards the object that casts it, by the height times tan θ. Until
+    such a ray is a quarter of a cell above all surfaces, it hits only where the grid shows it to be that much
+    deeper than at its start, or than 0: behind a wall next to it, for example.
 
     On a CPU each ray runs in a compiled loop. On other devices all rays take all steps together, without
     synchronisation.
@@ -88,11 +97,12 @@ def trace_grid(
         radius: half the edge of the cube, scene units.
         origins: starts of the rays, inside the cube.
         directions: unit directions.
+        leaves_surface: whether the origins are points of a surface.
     """
     hit_distance = HIT_CELLS * cell_size(grid, radius)
     compiled = ray_tracer(origins.device.type)
     if compiled is None or grid.dtype.itemsize < 4:
-        return _trace_together(grid, radius, origins, directions, hit_distance)
+        return _trace_together(grid, radius, origins, directions, hit_distance, leaves_surface)
     hits = GridHits(grid.new_empty(len(origins)), grid.new_empty(len(origins), dtype=torch.bool))
     compiled(
         grid,
@@ -100,6 +110,7 @@ def trace_grid(
         origins.to(grid.dtype),
         directions.to(grid.dtype),
         hit_distance=hit_distance,
+        leaves_surface=leaves_surface,
         steps=STEPS,
         distance=hits.distance,
         hit=hits.hit,
@@ -113,13 +124,17 @@ def _trace_together(
     origins: Float[Tensor, "P 3"],
     directions: Float[Tensor, "P 3"],
     hit_distance: float,
+    leaves_surface: bool,
 ) -> GridHits:
     distance, hit = torch.zeros_like(origins[:, 0]), torch.zeros_like(origins[:, 0], dtype=torch.bool)
-    gone = hit
+    gone, threshold = hit, torch.full_like(distance, hit_distance)
+    if leaves_surface:
+        threshold = look_up(grid, radius, origins).to(distance.dtype).clamp_max(0.0) - hit_distance
     for _ in range(STEPS):
         point = origins + distance[:, None] * directions
         clearance = look_up(grid, radius, point).to(distance.dtype)
         gone = gone | (point.abs().amax(-1) > radius)
-        hit = hit | ((clearance < hit_distance) & ~gone)
+        threshold = torch.where(clearance >= hit_distance, hit_distance, threshold)
+        hit = hit | ((clearance < threshold) & ~gone)
         distance = distance + torch.where(hit | gone, 0.0, clearance.clamp_min(hit_distance))
     return GridHits(distance, hit)

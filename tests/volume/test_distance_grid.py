@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch.nn.functional import normalize
@@ -59,9 +61,10 @@ def test_a_ray_that_leaves_the_cube_hits_nothing():
     assert not found.hit.any()
 
 
+@pytest.mark.parametrize("leaves_surface", [False, True])
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("field", [sphere_distance, plate])
-def test_compiled_loops_agree_with_the_reference(field, threads, monkeypatch):
+def test_compiled_loops_agree_with_the_reference(field, threads, leaves_surface, monkeypatch):
     torch.manual_seed(0)
     grid = sample_grid(field, RADIUS, 33, torch.zeros(1, dtype=torch.float64))
     origins = 3 * torch.rand(5000, 3, dtype=torch.float64) - 1.5
@@ -69,11 +72,11 @@ def test_compiled_loops_agree_with_the_reference(field, threads, monkeypatch):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(threads)
-        found = trace_grid(grid, RADIUS, origins, directions)
+        found = trace_grid(grid, RADIUS, origins, directions, leaves_surface=leaves_surface)
     finally:
         torch.set_num_threads(before)
     monkeypatch.setattr(distance_grid, "ray_tracer", lambda device: None)
-    expected = trace_grid(grid, RADIUS, origins, directions)
+    expected = trace_grid(grid, RADIUS, origins, directions, leaves_surface=leaves_surface)
     assert found.hit.any()
     assert not found.hit.all()
     assert torch.equal(found.hit, expected.hit)
@@ -86,3 +89,51 @@ def test_invalid_rays_hit_nothing():
     up = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3)
     assert not trace_grid(grid, RADIUS, broken, up).hit.any()
     assert not trace_grid(grid, RADIUS, up, broken).hit.any()
+
+
+def ball_above_floor(x: torch.Tensor) -> torch.Tensor:
+    """A ball of radius 0.3 whose lowest point is 0.2 above the floor z = 0."""
+    return torch.minimum(x[:, 2], (x - torch.tensor([0.0, 0.0, 0.5])).norm(dim=-1) - 0.3)
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 60.0])
+def test_a_shadow_lies_where_it_belongs(angle_deg):
+    """Rays that start above the floor, along its normal, shift the shadow by the height times tan θ."""
+    grid = sample_grid(ball_above_floor, RADIUS, 96, torch.zeros(1))
+    steps = torch.linspace(-1.2, 1.2, 161)
+    floor = torch.stack([*torch.meshgrid(steps, steps, indexing="ij"), torch.zeros(161, 161)], -1).view(-1, 3)
+    angle = math.radians(angle_deg)
+    sun = torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
+    is_dark = trace_grid(grid, RADIUS, floor, sun.expand_as(floor), leaves_surface=True).hit
+    to_ball = torch.tensor([0.0, 0.0, 0.5]) - floor
+    should_be_dark = torch.linalg.cross(to_ball, sun.expand_as(floor)).norm(dim=-1) < 0.3
+    shift = floor[is_dark].mean(0) - floor[should_be_dark].mean(0)
+    assert shift.norm() < 0.3 * cell_size(grid, RADIUS)
+    # A ray hits a quarter of a cell before a surface, so that shadows are larger by as much.
+    assert (is_dark & ~should_be_dark).float().mean() < 0.02
+    assert not (should_be_dark & ~is_dark).any()
+
+
+@pytest.mark.parametrize("height", [-0.75, 0.0, 0.2])
+def test_a_ray_does_not_hit_the_surface_that_it_leaves(height):
+    """Heights in cells: hits of a host and the surface of its grid differ a little."""
+    torch.manual_seed(0)
+    grid = sample_grid(lambda x: x[:, 2], RADIUS, 96, torch.zeros(1))
+    start = torch.rand(2000, 3) - torch.tensor([0.5, 0.5, 0.0])
+    start[:, 2] = height * cell_size(grid, RADIUS)
+    up = normalize(torch.randn(2000, 3), dim=-1)
+    up[:, 2] = up[:, 2].abs().clamp_min(0.02)
+    assert not trace_grid(grid, RADIUS, start, normalize(up, dim=-1), leaves_surface=True).hit.any()
+
+
+@pytest.mark.parametrize("distance", [0.1, 0.5, 2.0])
+def test_a_ray_hits_the_wall_next_to_its_start(distance):
+    """Distances of the wall in cells."""
+    grid = sample_grid(lambda x: torch.minimum(x[:, 2], 0.5 - x[:, 0]), RADIUS, 96, torch.zeros(1))
+    start = torch.tensor([[0.5 - distance * cell_size(grid, RADIUS), 0.0, 0.0]])
+    for tilt in (0.3, 1.0, 3.0):
+        towards = normalize(torch.tensor([[1.0, 0.0, tilt]]), dim=-1)
+        assert trace_grid(grid, RADIUS, start, towards, leaves_surface=True).hit.all()
+        assert not trace_grid(
+            grid, RADIUS, start, towards * torch.tensor([-1.0, 1, 1]), leaves_surface=True
+        ).hit.any()
