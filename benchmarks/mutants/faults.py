@@ -276,6 +276,20 @@ MUTANTS: Sequence[Mutant] = (
         "torch.nonzero(scene.hit | ~scene.hit, as_tuple=True)",
         "incident/test_arriving.py",
     ),
+    Mutant(
+        "a ray hits the surface that it leaves",
+        "kernels/compiled.py",
+        "elif leaves_surface and step == 0:",
+        "elif False:",
+        "volume/test_distance_grid.py",
+    ),
+    Mutant(
+        "a ray passes through the wall next to its start",
+        "kernels/compiled.py",
+        "threshold = min(clearance, number(0)) - hit_distance",
+        "threshold = number(-9)",
+        "volume/test_distance_grid.py",
+    ),
     # Readers.
     Mutant(
         "the camera's centre has the wrong sign",

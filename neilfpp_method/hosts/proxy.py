@@ -29,8 +29,8 @@ from neilfpp_method.volume.fusion import FusedSurface, fuse_surface, grid_normal
 
 __all__ = ["ProxyReport", "SurfaceProxy"]
 
-POINTS = 32_768
-"""Number of points kept: about four per cell on a surface of ten square units in a grid of 96³."""
+POINTS = 65_536
+"""Number of points kept: about five per cell on a surface of ten square units in a grid of 128³."""
 REFRESH_INTERVAL = 64
 """Steps between two refreshes. The first refreshes are at steps 1, 2, 4, 8, …"""
 EXPLORING_BATCHES, EXPLORING_RAYS = 16, 512

@@ -13,7 +13,7 @@ from neilfpp_method.hosts.proxy import REFRESH_INTERVAL, SurfaceProxy
 from neilfpp_method.structures import RayBatch, SceneLight
 from tests.hosts.table import CENTER, RADIUS, TableTop, camera_rays_above
 
-SCENE, CELLS = 1.75, 96
+SCENE, CELLS = 1.75, 128
 
 
 def gathered(host: TableTop, steps: int = 20, proxy: SurfaceProxy | None = None) -> SurfaceProxy:
