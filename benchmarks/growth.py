@@ -30,6 +30,7 @@ from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.optimizer import seed_step
@@ -106,7 +107,7 @@ def measure() -> list[Growth]:
     model, replace = fitted_model(base), dataclasses.replace
     base = model.config
     by_rays = tuple(step_seconds(model, base, count) for count in RAYS)
-    with_samples = [replace(base, volume=replace(base.volume, samples=n)) for n in SAMPLES]
+    with_samples = [changed(base, {"host.volume.samples": n}) for n in SAMPLES]
     by_samples = tuple(step_seconds(model, config, SMALL) for config in with_samples)
     with_directions = [replace(base, shading=replace(base.shading, train_samples=n)) for n in DIRECTIONS]
     by_directions = tuple(step_seconds(model, config, SMALL) for config in with_directions)

@@ -31,6 +31,7 @@ from neilfpp_method.kernels.process import computing_fast
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
@@ -70,11 +71,7 @@ def fitted_model(config: NeilfConfig, like: VolSdfHost | None = None) -> NeilfMo
     """A model with the table as a sharp surface, by a fit or copied from another host with the same
     networks.
     """
-    config = dataclasses.replace(
-        config,
-        loss=dataclasses.replace(config.loss, point_cloud=0.0),
-        volume=dataclasses.replace(config.volume, beta_init=SHARP),
-    )
+    config = changed(config, {"host.loss.point_cloud": 0.0, "host.volume.beta_init": SHARP})
     torch.manual_seed(0)
     facts = SceneFacts("linear", 0.2, 3.0, "constant")
     host = VolSdfHost(config, facts)
@@ -121,8 +118,7 @@ def step_on(model: NeilfModel, batch: PixelBatch) -> Callable[[], None]:
 
 def cheap_paper() -> NeilfConfig:
     """The networks of `paper-mlp` with skipping of empty space."""
-    config = preset("paper-mlp")
-    return dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=True))
+    return changed(preset("paper-mlp"), {"host.volume.skip_empty": True})
 
 
 def seconds_of(steps: Mapping[str, Callable[[], None]], fast: Mapping[str, bool]) -> dict[str, list[float]]:
@@ -152,7 +148,7 @@ def measurements() -> Iterator[Measurement]:
     plain = straightforward(cheap).to(device())
     # Half as many cuts as in the paper, and half of these on the rest of a ray that skips empty space
     # (`benchmarks.sampler` measures the error of that).
-    paper = sample_counts(preset("paper-mlp").volume)
+    paper = sample_counts(preset("paper-mlp").host.volume)
     cheap.host.sample_counts = plain.host.sample_counts = dataclasses.replace(paper, cuts=paper.cuts // 2)
     steps = {
         "plain": step_on(plain, batch),

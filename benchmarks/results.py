@@ -33,6 +33,7 @@ from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.evaluate.protocols import evaluate
 from neilfpp_method.report.write import REPORT, write_report
 from neilfpp_method.schedule import Stage, stage_steps
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import fixed_geometry, free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.build import build_model
@@ -82,21 +83,16 @@ def variants(config: NeilfConfig, which: str) -> dict[str, NeilfConfig]:
     compared = {
         "preset": config,
         "free light, with L_ref": free,
-        "free light, without L_ref": changed(free, "light", inter_reflection="off"),
+        "free light, without L_ref": changed(free, {"light.inter_reflection": "off"}),
     }
     if which == "ladder":
-        compared["free light, hard"] = changed(free, "light", inter_reflection="hard")
+        compared["free light, hard"] = changed(free, {"light.inter_reflection": "hard"})
         for kind, name in (("distant", "map"), ("distant_near", "map and lamps")):
             compared |= {
-                f"{name}, {mode}": changed(config, "light", kind=kind, inter_reflection=mode)
+                f"{name}, {mode}": changed(config, {"light": {"kind": kind, "inter_reflection": mode}})
                 for mode in ("hard", "off")
             }
     return compared
-
-
-def changed(config: NeilfConfig, room: str, **settings: object) -> NeilfConfig:
-    """The same settings with some of a group changed."""
-    return dataclasses.replace(config, **{room: dataclasses.replace(getattr(config, room), **settings)})
 
 
 def train(
@@ -165,7 +161,7 @@ def measure(out: Path, config: NeilfConfig) -> dict[str, dict[str, float]]:
 def main(options: Options) -> None:
     """Train, measure, and write the result file."""
     # The point clouds of captures with known truth lie on the true surface, which must be recovered.
-    config = changed(preset(options.preset), "loss", point_cloud=0.0)
+    config = changed(preset(options.preset), {"host.loss.point_cloud": 0.0})
     config = fixed_geometry(config) if options.host == "mesh" else config
     if options.material_steps is not None:
         config = dataclasses.replace(

@@ -19,6 +19,7 @@ from benchmarks.joint import SHARP, fitted_model, rays_at_the_table
 from benchmarks.measure import Measurement, median_seconds
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.empty_space import MAX_LIFE, RESOLUTION
@@ -39,9 +40,9 @@ SCALES = (0.03, 0.01, SHARP)  # of the density: a surface that is found, one tha
 
 def table_host(skip_empty: bool = True) -> VolSdfHost:
     """The host of the scene, with the paper's sampler."""
-    paper, small = preset("paper-ngp").volume, free_light(preset("fast"))
-    volume = dataclasses.replace(paper, radius=small.volume.radius, skip_empty=skip_empty)
-    host = fitted_model(dataclasses.replace(small, volume=volume)).host.train()
+    paper, small = preset("paper-ngp").host.volume, free_light(preset("fast"))
+    volume = {**to_dict(paper), "skip_empty": skip_empty}
+    host = fitted_model(changed(small, {"host.volume": volume})).host.train()
     host.sample_counts = sample_counts(paper)
     return host
 

@@ -7,7 +7,6 @@ point are the presets' own.
 
 from __future__ import annotations
 
-import dataclasses
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -20,6 +19,7 @@ from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import PRESETS, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
@@ -37,13 +37,8 @@ SHARP = 3e-3  # β of a surface that counts as trained, scene units
 
 def config_of(name: str) -> NeilfConfig:
     """A preset for the scene of the package, which has no point cloud, with a surface that can be shaded."""
-    config = preset(name)
-    return dataclasses.replace(
-        config,
-        loss=dataclasses.replace(config.loss, point_cloud=0.0),
-        train=dataclasses.replace(config.train, rays=RAYS),
-        volume=dataclasses.replace(config.volume, beta_init=SHARP),
-    )
+    changes = {"host.loss.point_cloud": 0.0, "host.volume.beta_init": SHARP, "train.rays": RAYS}
+    return changed(preset(name), changes)
 
 
 @cache

@@ -31,6 +31,7 @@ from neilfpp_method.fields.sdf import SdfField, SdfSample
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
@@ -154,11 +155,7 @@ def straightforward(model: NeilfModel) -> NeilfModel:
     """A model with the weights of another, whose host is VolSDF and whose light is the paper's, with the
     plain implementation.
     """
-    config = replace(
-        model.config,
-        volume=replace(model.config.volume, skip_empty=False),
-        shading=replace(model.config.shading, sampler="fibonacci"),
-    )
+    config = changed(model.config, {"host.volume.skip_empty": False, "shading.sampler": "fibonacci"})
     host = PlainHost(config, model.facts)
     plain = NeilfModel(host, config, model.facts)
     plain.load_state_dict({k: v for k, v in model.state_dict().items() if "empty_space" not in k})

@@ -196,7 +196,7 @@ def main(options: Options) -> None:
             for name in options.presets:
                 cap = float("inf") if name == "fast" else options.cap
                 # The clouds of captures with known truth are of the true surface, which is to be found.
-                config = changed(preset(name), {"loss.point_cloud": 0.0})
+                config = changed(preset(name), {"host.loss.point_cloud": 0.0})
                 curves[name] = curve(capture, config, cap, options.first, options.views, device)
                 Console().print(table({name: curves[name]}), markup=False, highlight=False, soft_wrap=True)
             sections.append(f"### {capture.name}\n\n{table(curves)}")

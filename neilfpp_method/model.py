@@ -98,7 +98,7 @@ class NeilfModel(nn.Module):
         self.stages = _stage_table(host, borrowed)
         self.check_outputs = OutputCheck(host, config.shading.hit_share, may_be_constant=borrowed)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
-        self.brdf = BrdfField(config.brdf, config.encoding, config.volume.radius)
+        self.brdf = BrdfField(config.brdf, config.encoding, config.background.radius)
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         self.poses: PoseCorrections | None = None

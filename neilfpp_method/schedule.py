@@ -23,7 +23,13 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig, TrainConfig, VolumeConfig
+from neilfpp_method.settings.types import (
+    GeometryLossConfig,
+    NeilfConfig,
+    OptimizerConfig,
+    TrainConfig,
+    VolumeConfig,
+)
 from neilfpp_method.structures import LossTerms
 
 __all__ = [
@@ -75,15 +81,17 @@ class StagePlan:
     """One row of a stage table.
 
     Attributes:
-        weights: for each loss whose weight is a setting, the name of that setting in `LossConfig`. The
-            weights of the other losses are fixed (`active_losses`).
+        weights: for each loss of every host whose weight is a setting, the name of that setting in
+            `LossConfig`. The weights of the other losses are fixed (`active_losses`).
         trains: parameter groups that the stage trains.
-        grows: for each loss whose weight changes during the stage, the setting with the factor by which it
-            has changed at the end of the stage.
+        geometry_weights: for each loss that only trains G, the name of its setting in `GeometryLossConfig`.
+        grows: for each of them whose weight changes during the stage, the setting with the factor by which
+            it has changed at the end of the stage.
     """
 
     weights: Mapping[str, str]
     trains: frozenset[str]
+    geometry_weights: Mapping[str, str] = field(default_factory=dict)
     grows: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -101,8 +109,9 @@ StageTable = Mapping[Stage, StagePlan]
 
 STAGES: StageTable = {
     Stage.SDF_INIT: StagePlan(
-        weights={
-            "volume": "volume",
+        weights={"volume": "volume"},
+        trains=GEOMETRY,
+        geometry_weights={
             "mask": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian",
@@ -110,20 +119,18 @@ STAGES: StageTable = {
             "point_cloud": "point_cloud",
             "patches": "patches",
         },
-        trains=GEOMETRY,
         grows={"hessian": "hessian_growth"},
     ),
     Stage.MATERIAL_INIT: StagePlan(weights=MATERIAL_LOSSES, trains=MATERIAL),
     Stage.JOINT: StagePlan(
-        weights={
-            "volume": "volume",
+        weights={"volume": "volume", **MATERIAL_LOSSES},
+        trains=GEOMETRY | MATERIAL,
+        geometry_weights={
             "mask": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian_joint",
             "surface": "surface_joint",
-            **MATERIAL_LOSSES,
         },
-        trains=GEOMETRY | MATERIAL,
     ),
 }
 
@@ -252,7 +259,8 @@ def active_losses(
 ) -> Mapping[str, float]:
     """The active losses of a stage with their weights.
 
-    A loss with weight 0, or of an effect that is switched off, is absent and is never computed.
+    A loss with weight 0, or of an effect that is switched off, is absent and is never computed. So are the
+    losses of G if the settings say that geometry is given.
 
     Args:
         stage: the stage of training.
@@ -262,9 +270,8 @@ def active_losses(
     """
     plan = stages[stage]
     weights = {loss: getattr(config.loss, setting) for loss, setting in plan.weights.items()}
-    weights |= {
-        loss: weights[loss] * getattr(config.loss, setting) ** share for loss, setting in plan.grows.items()
-    }
+    if config.geometry_loss is not None:
+        weights |= _geometry_weights(plan, config.geometry_loss, share)
     if plan.trains_material:
         weights["physical"] = 1.0
         if config.light.inter_reflection == "soft":
@@ -279,6 +286,13 @@ def active_losses(
         # Neither roughness nor metallic varies in space: their gradients are 0.
         weights.pop("smoothness", None)
     return {loss: weight for loss, weight in weights.items() if weight > 0}
+
+
+def _geometry_weights(plan: StagePlan, settings: GeometryLossConfig, share: float) -> dict[str, float]:
+    """Weights of the losses that only train G, after a share of the stage."""
+    weights = {loss: getattr(settings, setting) for loss, setting in plan.geometry_weights.items()}
+    grown = {loss: getattr(settings, setting) ** share for loss, setting in plan.grows.items()}
+    return {loss: weight * grown.get(loss, 1.0) for loss, weight in weights.items()}
 
 
 @dataclass(frozen=True)

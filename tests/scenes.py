@@ -11,7 +11,7 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import free_light, preset
-from neilfpp_method.settings.types import HashGridConfig, NeilfConfig, TrainConfig, VolSdfConfig
+from neilfpp_method.settings.types import HashGridConfig, NeilfConfig, TrainConfig
 from neilfpp_method.structures import PixelBatch, RayBatch
 
 
@@ -20,13 +20,16 @@ def tiny_config(**changes) -> NeilfConfig:
     config = free_light(preset("fast"))
     small = dataclasses.replace(
         config,
-        host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, width=16, feature_width=4)),
+        host=dataclasses.replace(
+            config.host,
+            sdf=dataclasses.replace(config.host.sdf, width=16, feature_width=4),
+            volume=dataclasses.replace(config.host.volume, samples=20, beta_init=0.02, skip_empty=False),
+        ),
         encoding=HashGridConfig(levels=3, log2_entries=10, sdf_log2_entries=10, max_resolution=32),
         radiance=dataclasses.replace(config.radiance, layers=1, width=16),
         brdf=dataclasses.replace(config.brdf, layers=1, width=16),
         light=dataclasses.replace(config.light, layers=4, width=16, rays_per_point=0.5),
         background=dataclasses.replace(config.background, samples=4),
-        volume=dataclasses.replace(config.volume, samples=20, beta_init=0.02, skip_empty=False),
         shading=dataclasses.replace(config.shading, train_samples=8, eval_samples=8),
         loss=dataclasses.replace(config.loss, lambertian=5e-4),  # every loss of the table counts
         train=TrainConfig(sdf_steps=4, material_steps=4, joint_steps=4, rays=48, checkpoint_every=3),

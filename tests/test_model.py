@@ -18,6 +18,7 @@ from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import MapLightConfig, MeshConfig, NeilfConfig
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.optimizer import make_optimizer
@@ -72,8 +73,7 @@ def test_an_effect_that_is_off_makes_no_queries():
     first_stage = count_queries(model, lambda: model.losses(batch, Stage.SDF_INIT))
     assert first_stage["brdf"] == first_stage["light"] == 0
 
-    no_hessian = dataclasses.replace(base, loss=dataclasses.replace(base.loss, hessian=0.0))
-    plain = sphere_model(no_hessian)
+    plain = sphere_model(changed(base, {"host.loss.hessian": 0.0}))
     fewer = count_queries(plain, lambda: plain.losses(batch, Stage.SDF_INIT))
     assert fewer["sdf"] < first_stage["sdf"]
 

@@ -20,7 +20,7 @@ from neilfpp_method.schedule import (
     weigh,
 )
 from neilfpp_method.settings.plain import from_dict, to_dict
-from neilfpp_method.settings.presets import PRESETS, preset
+from neilfpp_method.settings.presets import PRESETS, fixed_geometry, preset
 from neilfpp_method.settings.types import OptimizerConfig, TrainConfig
 from neilfpp_method.structures import LossTerm
 
@@ -47,12 +47,19 @@ def test_the_joint_stage_lowers_hessian_and_surface():
 def test_the_weight_of_the_hessian_grows_only_in_sdf_init():
     config = preset("fast")
     weights = [active_losses(Stage.SDF_INIT, config, share=share) for share in (0.0, 0.5, 1.0)]
-    growth = config.loss.hessian_growth
+    growth = config.host.loss.hessian_growth
     assert growth > 1
     assert weights[1]["hessian"] == pytest.approx(weights[0]["hessian"] * growth**0.5)
     assert weights[2]["hessian"] == pytest.approx(weights[0]["hessian"] * growth)
-    assert [w["eikonal"] for w in weights] == [config.loss.eikonal] * 3
-    assert active_losses(Stage.JOINT, config, share=1.0)["hessian"] == config.loss.hessian_joint
+    assert [w["eikonal"] for w in weights] == [config.host.loss.eikonal] * 3
+    assert active_losses(Stage.JOINT, config, share=1.0)["hessian"] == config.host.loss.hessian_joint
+
+
+@pytest.mark.parametrize("stage", Stage)
+def test_given_geometry_has_no_losses_of_g(stage):
+    """Also with the stages of the paper, for a host that has no stages of its own."""
+    of_geometry = {"eikonal", "hessian", "surface", "point_cloud", "patches", "mask"}
+    assert not of_geometry & active_losses(stage, fixed_geometry(preset("fast"))).keys()
 
 
 def factors(config: OptimizerConfig, stage: Stage, steps: list[int], length: int) -> list[float]:
@@ -146,11 +153,12 @@ def test_an_unknown_preset_is_named():
 
 
 def test_the_surface_width_is_bounded_from_sdf_init_on():
-    fast = preset("fast").volume
+    fast = preset("fast").host.volume
     widths = [surface_width_limit(fast, StagePosition(Stage.SDF_INIT, k, 100)) for k in (0, 50, 99)]
     assert widths[0] == pytest.approx(fast.beta_init)
     assert widths[1] == pytest.approx(math.sqrt(fast.beta_init * fast.beta_final))
     assert widths[1] > widths[2] > fast.beta_final
     assert surface_width_limit(fast, StagePosition(Stage.JOINT, 0, 100)) == fast.beta_final
     assert surface_width_limit(fast, StagePosition(Stage.MATERIAL_INIT, 0, 100)) == math.inf
-    assert surface_width_limit(preset("paper-mlp").volume, StagePosition(Stage.SDF_INIT, 99, 100)) == math.inf
+    published = preset("paper-mlp").host.volume
+    assert surface_width_limit(published, StagePosition(Stage.SDF_INIT, 99, 100)) == math.inf

@@ -17,6 +17,7 @@ from nerfstudio.scripts import train
 from neilfpp_method.data.files.images import read_image, write_exr
 from neilfpp_method.demo.command import demo_scene
 from neilfpp_method.schedule import stage_steps
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import LightFitConfig, NeilfConfig
 from tests.train.small_runs import small_config
@@ -49,11 +50,11 @@ def small_settings(**steps: int) -> NeilfConfig:
     """The tiny settings with the light of the preset, fitted at every third step, and four steps per stage
     unless `steps` changes it. Photographs have one exposure.
     """
-    config, usual = small_config(**steps), preset("fast")
+    usual = preset("fast")
+    config = changed(small_config(**steps), {"host.volume.beta_final": usual.host.volume.beta_final})
     fit = LightFitConfig(points=48, every=3)
     return dataclasses.replace(
         config,
-        volume=dataclasses.replace(config.volume, beta_final=usual.volume.beta_final),
         light=dataclasses.replace(usual.light, environment_height=8, fit=fit),
         optimizer=dataclasses.replace(config.optimizer, exposure=0.0),
     )

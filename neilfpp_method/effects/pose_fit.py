@@ -119,7 +119,7 @@ def _render(model: NeilfModel, batch: PixelBatch, pixel: Float[Tensor, " V"]) ->
         color = hits.color if model.gains is None else hits.color * model.gains(view[rows])
         colors.append(_encode(model, color))
         # A ray that misses the scene shows the background, which is far away.
-        far = part.origins.norm(dim=-1) + model.config.volume.radius
+        far = part.origins.norm(dim=-1) + model.config.background.radius
         distance = ((hits.position - part.origins) * part.directions).sum(-1)
         distances.append(torch.where(hits.opacity > 0.5, distance, far))
     color = torch.cat(colors).view(-1, CONE_RAYS, 3)

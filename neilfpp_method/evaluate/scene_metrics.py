@@ -39,12 +39,11 @@ def chamfer_metrics(run: Run, truth: Mesh) -> dict[str, float]:
     true = trimesh.Trimesh(truth.vertices.numpy(), truth.faces.numpy(), process=False)
     margin = MARGIN * np.linalg.norm(true.extents)
     low, high = true.bounds[0] - margin, true.bounds[1] + margin
-    volume = run.config.volume
     corner = np.linalg.norm(np.maximum(np.abs(low), np.abs(high)))
     device = run.device
     # Stay inside the sphere that may close the scene, which is not part of the object. Parts outside the
     # box are removed below.
-    radius = min(float(corner), volume.radius - HIT_RADIUS)
+    radius = min(float(corner), run.config.background.radius - HIT_RADIUS)
     surface = extract_mesh(run.model.host.sdf, radius, MESH_RESOLUTION, device=device)
     points = metrics.sample_surface(surface, SURFACE_POINTS)
     points = points[((points >= low) & (points <= high)).all(axis=-1)]

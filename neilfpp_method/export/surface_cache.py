@@ -136,7 +136,7 @@ def _extract(run: Run, resolution: int) -> ExtractedSurface:
     host = run.model.host
     assert isinstance(host, HasSdf)
     # Stay inside the sphere that may close the scene, which is not part of the object.
-    mesh = extract_mesh(host.sdf, run.config.volume.radius - HIT_RADIUS, resolution, device=run.device)
+    mesh = extract_mesh(host.sdf, run.config.background.radius - HIT_RADIUS, resolution, device=run.device)
     return ExtractedSurface(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32))
 
 
@@ -159,10 +159,11 @@ def _fingerprint(run: Run, resolution: int) -> str | None:
 
     The kind of device is included, because another one rounds differently.
     """
-    host, volume = run.model.host, run.config.volume
+    host, config = run.model.host, run.config
     if not isinstance(host, VolSdfHost):
         return None
-    settings = (FORMAT, __version__, resolution, volume.radius, volume.normal_radius, run.device.type)
+    radii = (config.background.radius, config.host.volume.normal_radius)
+    settings = (FORMAT, __version__, resolution, *radii, run.device.type)
     digest = hashlib.sha256(repr(settings).encode())
     for name, tensor in _distance_tensors(host):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())

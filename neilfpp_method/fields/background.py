@@ -43,7 +43,6 @@ class InvertedSphere(nn.Module):
     Args:
         config: the settings.
         encoding: kind and sizes of the position encoding.
-        radius: radius of the scene sphere.
         scale: largest radiance.
         start: initial linear RGB, the same in all directions; if None, half of the largest radiance.
     """
@@ -52,12 +51,11 @@ class InvertedSphere(nn.Module):
         self,
         config: BackgroundConfig,
         encoding: FrequencyConfig | HashGridConfig,
-        radius: float,
         scale: float,
         start: Float[Tensor, " 3"] | None = None,
     ) -> None:
         super().__init__()
-        self.radius = radius
+        self.radius = config.radius
         self.scale = scale
         self.samples = config.samples
         if isinstance(encoding, FrequencyConfig):

@@ -137,15 +137,15 @@ BETA_STUCK = Case(
     name="beta_stuck",
     severe=True,
     cause="a width β that is only learned, and photographs that fog explains well enough",
-    remedy="bound it (volume.beta_final to 0.002), raise its learning rate (optimizer.beta), or start lower "
-    "(volume.beta_init)",
+    remedy="bound it (host.volume.beta_final to 0.002), raise its learning rate (optimizer.beta), or start "
+    "lower (host.volume.beta_init)",
 )
 OFF_CLOUD = Case(
     name="off_point_cloud",
     severe=True,
     cause="views that overlap so little that a shell in front of the object explains them as well",
-    remedy="raise the weight of the cloud (loss.point_cloud to 1) or take more images; if the cloud is "
-    "wrong, leave it out (loss.point_cloud 0)",
+    remedy="raise the weight of the cloud (host.loss.point_cloud to 1) or take more images; if the cloud is "
+    "wrong, leave it out (host.loss.point_cloud 0)",
 )
 NOTHING_SHADED = Case(
     name="nothing_shaded",

@@ -40,7 +40,7 @@ Blending over two surfaces causes a few such hits in a correct host.
 """
 LOST_DISTANCE = 10.0
 """Median distance of hits from the origin above which nothing can be estimated: the fields of material and
-light end at the scene's bounding box, `volume.radius`.
+light end at the scene's bounding box, `background.radius`.
 """
 MAX_LOST_SHARE = 0.02
 """Largest share of hits beyond `LOST_DISTANCE`. More of them are a background that counts as a surface."""

@@ -56,7 +56,7 @@ def proxy_for(host: object, config: NeilfConfig) -> SurfaceProxy | None:
     if isinstance(host, TracesLight) or not (cannot_trace or mode == "hard"):
         return None
     radiance = host.radiance if isinstance(host, HasRadiance) else None
-    return SurfaceProxy(config.volume.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
+    return SurfaceProxy(config.background.radius, GRID_RESOLUTION, config.shading.hit_share, radiance)
 
 
 class ForeignHost(nn.Module):

@@ -26,7 +26,6 @@ from neilfpp_method.hosts.mesh_tracing import (
     normals_towards_viewer,
 )
 from neilfpp_method.hosts.radiance import background_field, radiance_field
-from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
 from neilfpp_method.schedule import FIXED_GEOMETRY
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
@@ -85,7 +84,6 @@ class MeshHost(nn.Module):
         self.register_buffer("outward", outward, persistent=False)
         self.register_buffer("corner_normals", smooth.expand(-1, 3, -1), persistent=False)
         self.offset = config.ray_offset
-        self.normal_radius = config.volume.normal_radius
         self._tracers: dict[torch.device, FirstHits] = {}
         self._fingerprint = _fingerprint(triangles)
         self.register_load_state_dict_post_hook(_accept_without_fingerprint)
@@ -139,21 +137,6 @@ class MeshHost(nn.Module):
             )
         distance = distance.view(wi.shape[:2])
         return SceneLight(distance.isfinite(), radiance.view(wi.shape), distance)
-
-    @torch.no_grad()
-    def smooth_normals(
-        self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
-    ) -> Float[Tensor, "N 3"]:
-        """Normals smoothed within `volume.normal_radius` of hits; the hit normals if it is 0."""
-        if self.normal_radius == 0:
-            return normal
-        up = normal.repeat_interleave(NEIGHBORS, 0)
-
-        def normals_below(x: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-            hit = self.intersect(RayBatch(x + self.normal_radius * up, -up))
-            return torch.zeros_like(x).index_put((hit.rows,), hit.normal * hit.outside[:, None])
-
-        return smooth_normals(normals_below, position, normal, self.normal_radius)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters of R and, if it is a field, of the background."""

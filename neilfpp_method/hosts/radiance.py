@@ -16,7 +16,7 @@ def radiance_field(config: NeilfConfig, facts: SceneFacts, feature_width: int) -
     """Make R with the range and the initial value of a scene; G has `feature_width` features, or none."""
     scale, start = facts.radiance_scale, facts.median_radiance
     return OutgoingRadianceField(
-        config.radiance, config.encoding, feature_width, config.volume.radius, scale, start
+        config.radiance, config.encoding, feature_width, config.background.radius, scale, start
     )
 
 
@@ -25,4 +25,4 @@ def background_field(config: NeilfConfig, facts: SceneFacts) -> InvertedSphere |
     if facts.background != "inverted_sphere":
         return None
     scale, start = facts.radiance_scale, torch.tensor(facts.background_color)
-    return InvertedSphere(config.background, config.encoding, config.volume.radius, scale, start)
+    return InvertedSphere(config.background, config.encoding, scale, start)

@@ -39,8 +39,8 @@ scene (published code: 8192 and 4096 points).
 HIT_RADIUS = 0.05
 """The concentration of a hit is the rendering weight within this distance of it, scene units (METHOD §2)."""
 SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
-"""Width ε of the smoothed delta of L_surf by `loss.points`, scene units; that of "scene" is the published
-value.
+"""Width ε of the smoothed delta of L_surf by `host.loss.points`, scene units; that of "scene" is the
+published value.
 """
 GRID_LIFE = 100
 """Training steps of the geometry after which the distance grid is sampled again."""
@@ -97,18 +97,18 @@ class VolSdfHost(nn.Module):
         # Buffers follow the host to its device. They are not in checkpoints, as the capture has them.
         self.register_buffer("point_position", None if points is None else points.position, persistent=False)
         self.register_buffer("point_normal", None if points is None else points.normal, persistent=False)
-        radius = config.volume.radius
-        sdf = config.host.sdf
+        self.radius = radius = config.background.radius
+        sdf, volume = config.host.sdf, config.host.volume
         self.sdf_field = SdfField(sdf, config.encoding, radius)
         self.radiance_field = radiance_field(config, facts, sdf.feature_width)
-        self.density = LaplaceDensity(config.volume.beta_init)
+        self.density = LaplaceDensity(volume.beta_init)
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
         self.cameras = cameras
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
         self.free_space = None if balls is None else FreeSpace(balls, radius)
-        self.empty_space = EmptySpace(radius) if config.volume.skip_empty else None
-        self.sample_counts = sample_counts(config.volume)
+        self.empty_space = EmptySpace(radius) if volume.skip_empty else None
+        self.sample_counts = sample_counts(volume)
         hard = config.light.inter_reflection == "hard"
         resolution = GRID_RESOLUTION if hard else 0
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
@@ -122,8 +122,8 @@ class VolSdfHost(nn.Module):
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
 
-        With `volume.skip_empty`, evaluation without gradients samples only the parts of rays that may be
-        visible, according to a grid of the current field.
+        With `host.volume.skip_empty`, evaluation without gradients samples only the parts of rays that may
+        be visible, according to a grid of the current field.
         """
         # Without a background the scene sphere has the radiance R, so no ray can be skipped.
         cannot_skip = self.empty_space is None or self.background_kind == "none"
@@ -170,7 +170,7 @@ class VolSdfHost(nn.Module):
         """
         origins = x[:, None].expand_as(wi).reshape(-1, 3)
         directions = wi.reshape(-1, 3)
-        traced = trace_grid(self._grid(), self.config.volume.radius, origins, directions, leaves_surface=True)
+        traced = trace_grid(self._grid(), self.radius, origins, directions, leaves_surface=True)
         rows = torch.nonzero(traced.hit)[:, 0]
         points = origins[rows] + traced.distance[rows, None] * directions[rows]
         surface = self.sdf_field.with_gradient(points)
@@ -185,8 +185,8 @@ class VolSdfHost(nn.Module):
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Normals smoothed within `volume.normal_radius` of hits; the hit normals if it is 0."""
-        radius = self.config.volume.normal_radius
+        """Normals smoothed within `host.volume.normal_radius` of hits; the hit normals if it is 0."""
+        radius = self.config.host.volume.normal_radius
         if radius == 0:
             return normal
         return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
@@ -196,7 +196,7 @@ class VolSdfHost(nn.Module):
         """Which rays that start at a surface may hit one, by the grid of empty space; all without a grid."""
         if self.empty_space is None:
             return torch.ones(len(rays), dtype=torch.bool, device=rays.origins.device)
-        interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        interval = sphere_interval(rays.origins, rays.directions, self.radius)
         return self.empty_space.may_hit(self.sdf, rays, interval, self.surface_width())
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -225,9 +225,7 @@ class VolSdfHost(nn.Module):
 
     def _grid(self) -> Float[Tensor, "R R R"]:
         if self.grid_age is None or self.grid_age >= GRID_LIFE:
-            fresh = sample_grid(
-                self.sdf, self.config.volume.radius, self.distance_grid.shape[0], self.distance_grid
-            )
+            fresh = sample_grid(self.sdf, self.radius, self.distance_grid.shape[0], self.distance_grid)
             self.distance_grid.copy_(fresh)
             self.grid_age = 0
         return self.distance_grid
@@ -258,9 +256,9 @@ class VolSdfHost(nn.Module):
         """Render a field that is not being trained; rays that miss the scene cost only grid look-ups."""
         versions = [(id(p), p._version) for p in self.sdf_field.parameters()]
         if self._evaluation_space is None or self._evaluation_space.versions != versions:
-            space = EmptySpace(self.config.volume.radius).to(rays.origins)
+            space = EmptySpace(self.radius).to(rays.origins)
             self._evaluation_space = EvaluationSpace(versions, space)
-        interval = sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        interval = sphere_interval(rays.origins, rays.directions, self.radius)
         span = self._evaluation_space.space.may_show(self.sdf, rays, interval, self.surface_width())
         zeros = torch.zeros_like(interval.far)
         missed = SurfaceHits(
@@ -279,7 +277,7 @@ class VolSdfHost(nn.Module):
 
     def _march(self, rays: RayBatch, part: Interval | None = None, colored: bool = True) -> March:
         """Sample and blend rays, in `part` of each if it is known; colours are 0 unless `colored`."""
-        interval = part or sphere_interval(rays.origins, rays.directions, self.config.volume.radius)
+        interval = part or sphere_interval(rays.origins, rays.directions, self.radius)
         narrowed = part is not None
         if self.empty_space is not None and self.training:
             narrow = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
@@ -354,7 +352,7 @@ class VolSdfHost(nn.Module):
         if "eikonal" in names:
             terms["eikonal"] = losses.eikonal(inputs.gradient)
         if "surface" in names:
-            terms["surface"] = losses.surface(inputs.distance, SURFACE_WIDTH[self.config.loss.points])
+            terms["surface"] = losses.surface(inputs.distance, SURFACE_WIDTH[self.config.host.loss.points])
         if "hessian" in names:
             terms["hessian"] = losses.hessian(self.sdf_field.hessian(inputs.hessian_points))
         if "point_cloud" in names and (points := self.points) is not None:
@@ -376,13 +374,13 @@ class VolSdfHost(nn.Module):
         return losses.mask(depth, batch.mask, batch.mask_known, beta)
 
     def _regularizer_inputs(self, march: March) -> RegularizerInputs:
-        """Inputs of the regularisers of G, at the points that `loss.points` names."""
+        """Inputs of the regularisers of G, at the points that `host.loss.points` names."""
         position = march.hits.position.detach()
-        if self.config.loss.points == "rays":
+        if self.config.host.loss.points == "rays":
             near_surface = position + HIT_RADIUS * torch.randn_like(position)
             return RegularizerInputs(march.surface.gradient, march.surface.distance, near_surface)
         about_object = torch.empty_like(position).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
-        anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.config.volume.radius
+        anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.radius
         points = torch.cat((about_object, anywhere))
         sample = self.sdf_field.with_gradient(points)
         rays, count = march.distances.shape

@@ -157,7 +157,7 @@ class Steps:
 
     def solve_light(self, step: int) -> None:
         """Bound β, solve for the light and search the material if due, after the optimizer's step."""
-        limit_surface_width(self.neilf.host, self.settings.volume, stage_at(step, self.settings.train))
+        limit_surface_width(self.neilf.host, self.settings, stage_at(step, self.settings.train))
         if restore_surface(self.neilf.host, stage_at(step + 1, self.settings.train)):
             CONSOLE.log(f"step {step + 1}: the surface had vanished and is restored")
         if self._computed is None:

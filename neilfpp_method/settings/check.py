@@ -7,22 +7,21 @@ Python does not check the types and choices of a dataclass, so they are checked 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
+from operator import attrgetter
+from typing import Any
 
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.plain import from_dict, to_dict
-from neilfpp_method.settings.types import NeilfConfig
+from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
 
 __all__ = ["check_config"]
 
-COUNTS = {
-    "train": ("rays", "checkpoint_every"),
-    "shading": ("train_samples", "eval_samples"),
-    "volume": ("samples",),
-}
-"""Settings that are at least 1, by group."""
-INITIAL_VALUES = ("initial_base_color", "initial_metallic")
-"""Settings of `brdf` between 0 and 1, without these bounds: the sigmoid of the field does not reach them."""
+COUNTS = ("train.rays", "train.checkpoint_every", "shading.train_samples", "shading.eval_samples")
+"""Settings that are at least 1."""
+INITIAL_VALUES = ("brdf.initial_base_color", "brdf.initial_metallic")
+"""Settings between 0 and 1, without these bounds: the sigmoid of the field does not reach them."""
 MAX_SEED = 2**32 - 1
 """Largest seed. The seed of a step is a multiple of it (`seed_step`) that must fit into 64 bits."""
 
@@ -35,10 +34,8 @@ def check_config(config: NeilfConfig) -> None:
     """
     from_dict(NeilfConfig, to_dict(config))
     _check_ranges(config)
-    if config.volume.beta_final < 0:
-        raise UserError(
-            f"--config.volume.beta-final is {config.volume.beta_final}", "set it to 0 (no bound) or more"
-        )
+    if isinstance(config.host, VolSdfConfig):
+        _check_recovered_geometry(config)
     rates = config.optimizer
     if min(rates.final) <= 0 or min(rates.drops) < 0 or rates.warm_up < 0:
         raise UserError(
@@ -48,23 +45,38 @@ def check_config(config: NeilfConfig) -> None:
 
 
 def _check_ranges(config: NeilfConfig) -> None:
-    for group, names in COUNTS.items():
-        for name in names:
-            _require(getattr(getattr(config, group), name) >= 1, config, group, name, "1 or more")
-    _require(0 <= config.train.seed <= MAX_SEED, config, "train", "seed", f"0 to {MAX_SEED}")
-    _require(0 <= config.shading.hit_share <= 1, config, "shading", "hit_share", "0 to 1")
+    for name in COUNTS:
+        _require(lambda count: count >= 1, config, name, "1 or more")
+    _require(lambda seed: 0 <= seed <= MAX_SEED, config, "train.seed", f"0 to {MAX_SEED}")
+    _require(lambda share: 0 <= share <= 1, config, "shading.hit_share", "0 to 1")
     for name in INITIAL_VALUES:
-        _require(0 < getattr(config.brdf, name) < 1, config, "brdf", name, "a number above 0 and below 1")
-    for name in ("radius", "beta_init"):
-        value = getattr(config.volume, name)
-        _require(0 < value < math.inf, config, "volume", name, "a number above 0")
+        _require(lambda value: 0 < value < 1, config, name, "a number above 0 and below 1")
+    _require(_is_positive, config, "background.radius", "a number above 0")
     for group in ("loss", "optimizer"):
-        for name, value in asdict(getattr(config, group)).items():
-            if isinstance(value, int | float):
-                _require(0 <= value < math.inf, config, group, name, "0 or more")
+        _check_not_negative(config, group)
 
 
-def _require(passed: bool, config: NeilfConfig, group: str, name: str, wanted: str) -> None:
-    if not passed:
-        option = f"--config.{group.replace('_', '-')}.{name.replace('_', '-')}"
-        raise UserError(f"{option} is {getattr(getattr(config, group), name)}", f"set it to {wanted}")
+def _check_recovered_geometry(config: NeilfConfig) -> None:
+    """The settings that only a host with a distance field has."""
+    _require(lambda count: count >= 1, config, "host.volume.samples", "1 or more")
+    _require(_is_positive, config, "host.volume.beta_init", "a number above 0")
+    _require(lambda bound: not bound < 0, config, "host.volume.beta_final", "0 (no bound) or more")
+    _check_not_negative(config, "host.loss")
+
+
+def _is_positive(value: float) -> bool:
+    return 0 < value < math.inf
+
+
+def _check_not_negative(config: NeilfConfig, group: str) -> None:
+    """Check all numbers of a group."""
+    for name, value in asdict(attrgetter(group)(config)).items():
+        if isinstance(value, int | float):
+            _require(lambda number: 0 <= number < math.inf, config, f"{group}.{name}", "0 or more")
+
+
+def _require(passes: Callable[[Any], bool], config: NeilfConfig, name: str, wanted: str) -> None:
+    """Check the value of a setting with a dotted name."""
+    value = attrgetter(name)(config)
+    if not passes(value):
+        raise UserError(f"--config.{name.replace('_', '-')} is {value}", f"set it to {wanted}")

@@ -169,8 +169,10 @@ IncidentLightConfig = Annotated[FreeLightConfig | MapLightConfig, tyro.conf.Avoi
 
 @dataclass(frozen=True)
 class BackgroundConfig:
-    """Radiance that rays get from beyond the scene sphere."""
+    """The scene sphere, and the radiance that rays get from beyond it."""
 
+    radius: float = 3.0
+    """Radius of the scene sphere, at which rays end and the background begins."""
     kind: Literal["auto", "none", "constant", "inverted_sphere"] = "auto"
     """none: R on the scene sphere, which closes the scene. constant: one colour. inverted_sphere: a NeRF++
     field. auto: constant if the image borders show a single colour behind the scene, else inverted_sphere.
@@ -187,12 +189,61 @@ class BackgroundConfig:
 
 
 @dataclass(frozen=True)
+class VolumeConfig:
+    """Volume rendering of G, and normals of what is rendered (METHOD §3)."""
+
+    beta_init: float = 0.1
+    """Initial scale β of the Laplace density."""
+    beta_final: float = 0.0
+    """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound."""
+    skip_empty: bool = False
+    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation.
+    The sampler then queries the SDF less often, as the rest of a ray is short.
+    """
+    samples: int = 98
+    """Rendered samples per ray: two thirds by opacity, the rest spread over the whole ray with both ends."""
+    normal_radius: float = 0.0
+    """Radius within which normals are smoothed for shading, except across edges. 0: no smoothing."""
+
+
+@dataclass(frozen=True)
+class GeometryLossConfig:
+    """Weights of the losses that only train G (METHOD §4), relative to L_phys. 0 switches a loss off."""
+
+    eikonal: float = 0.1
+    """Weight of L_Eik: gradients of G have length 1."""
+    hessian: float = 1e-3
+    """Weight of L_Hess (little curvature of G) at the start of SDF init."""
+    hessian_growth: float = 1.0
+    """Factor on the weight of L_Hess at the end of SDF init. A low weight first lets the shape form."""
+    hessian_joint: float = 1e-4
+    """Weight of L_Hess in the joint stage."""
+    surface: float = 1e-3
+    """Weight of L_surf (no unseen surfaces) in SDF init."""
+    surface_joint: float = 1e-4
+    """Weight of L_surf in the joint stage."""
+    point_cloud: float = 0.0
+    """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
+    patches: float = 0.0
+    """Weight of L_patch in SDF init: patches of the surface look alike in all views that show them."""
+    mask: float = 0.0
+    """Weight of the loss of the opacity against the object mask, at pixels whose mask is known."""
+    points: Literal["scene", "rays"] = "rays"
+    """Points of L_Eik, L_Hess and L_surf. scene: random points in the whole scene, more of them around the
+    object, and one sample per ray for L_Eik; L_surf is then so wide that its gradient is almost 0 (published
+    code). rays: the samples of the rays, and points around their hits for L_Hess.
+    """
+
+
+@dataclass(frozen=True)
 class VolSdfConfig:
     """Geometry is recovered: a signed distance field, rendered as a volume (`volume`)."""
 
     kind: Literal["volsdf"] = "volsdf"
     """Source of geometry: volsdf (recovered) or mesh (given)."""
     sdf: SdfConfig = field(default_factory=SdfConfig)
+    volume: VolumeConfig = field(default_factory=VolumeConfig)
+    loss: GeometryLossConfig = field(default_factory=GeometryLossConfig)
 
 
 @dataclass(frozen=True)
@@ -208,26 +259,6 @@ class MeshConfig:
 
 
 HostConfig = Annotated[VolSdfConfig | MeshConfig, tyro.conf.AvoidSubcommands]
-
-
-@dataclass(frozen=True)
-class VolumeConfig:
-    """Volume rendering of the VolSDF host (METHOD §3)."""
-
-    radius: float = 3.0
-    """Radius of the scene sphere, at which rays end."""
-    beta_init: float = 0.1
-    """Initial scale β of the Laplace density."""
-    beta_final: float = 0.0
-    """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound."""
-    skip_empty: bool = False
-    """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation.
-    The sampler then queries the SDF less often, as the rest of a ray is short.
-    """
-    samples: int = 98
-    """Rendered samples per ray: two thirds by opacity, the rest spread over the whole ray with both ends."""
-    normal_radius: float = 0.0
-    """Radius within which normals are smoothed for shading, except across edges. 0: no smoothing."""
 
 
 # ---------------------------------------------------------------------------------------------------- shading
@@ -259,7 +290,9 @@ class ShadingConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the losses (METHOD §4), relative to L_phys, whose weight is 1. 0 switches a loss off."""
+    """Weights of the losses of every host (METHOD §4), relative to L_phys, whose weight is 1. 0 switches a
+    loss off.
+    """
 
     unit: Literal["activation", "median"] = "activation"
     """Unit of radiance. activation (the paper): the range of R's output for L_vol, 1 for the other losses.
@@ -268,33 +301,10 @@ class LossConfig:
     """
     volume: float = 1.0
     """Weight of L_vol, the error of the volume-rendered colour."""
-    eikonal: float = 0.1
-    """Weight of L_Eik: gradients of G have length 1."""
-    hessian: float = 1e-3
-    """Weight of L_Hess (little curvature of G) at the start of SDF init."""
-    hessian_growth: float = 1.0
-    """Factor on the weight of L_Hess at the end of SDF init. A low weight first lets the shape form."""
-    hessian_joint: float = 1e-4
-    """Weight of L_Hess in the joint stage."""
-    surface: float = 1e-3
-    """Weight of L_surf (no unseen surfaces) in SDF init."""
-    surface_joint: float = 1e-4
-    """Weight of L_surf in the joint stage."""
-    point_cloud: float = 0.0
-    """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
-    patches: float = 0.0
-    """Weight of L_patch in SDF init: patches of the surface look alike in all views that show them."""
     smoothness: float = 5e-4
     """Weight of L_smth: roughness and metallic are smooth where the image is."""
     lambertian: float = 5e-4
     """Weight of L_Lam: roughness 1 and metallic 0 without evidence to the contrary."""
-    mask: float = 0.0
-    """Weight of the loss of the opacity against the object mask, at pixels whose mask is known."""
-    points: Literal["scene", "rays"] = "rays"
-    """Points of L_Eik, L_Hess and L_surf. scene: random points in the whole scene, more of them around the
-    object, and one sample per ray for L_Eik; L_surf is then so wide that its gradient is almost 0 (published
-    code). rays: the samples of the rays, and points around their hits for L_Hess.
-    """
     position_gradient: float = 0.1
     """Factor on the gradient of L_phys into the hit position, in the joint stage."""
     normal_gradient: float = 1.0
@@ -363,7 +373,6 @@ class NeilfConfig:
     brdf: BrdfConfig = field(default_factory=BrdfConfig)
     light: IncidentLightConfig = field(default_factory=FreeLightConfig)
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
-    volume: VolumeConfig = field(default_factory=VolumeConfig)
     shading: ShadingConfig = field(default_factory=ShadingConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -373,6 +382,11 @@ class NeilfConfig:
     def known_map(self) -> str | None:
         """File of the given environment map; None if the light is recovered."""
         return self.light.map if isinstance(self.light, MapLightConfig) else None
+
+    @property
+    def geometry_loss(self) -> GeometryLossConfig | None:
+        """Weights of the losses that train G; None if geometry is given."""
+        return self.host.loss if isinstance(self.host, VolSdfConfig) else None
 
     @property
     def ray_offset(self) -> float:

@@ -190,7 +190,8 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
 
     Returns None if the settings use no point cloud.
     """
-    if config.host.kind != "volsdf" or config.loss.point_cloud == 0.0:
+    losses = config.geometry_loss
+    if losses is None or losses.point_cloud == 0.0:
         return None
     if capture.point_cloud is None:
         return (
@@ -198,7 +199,7 @@ def cloud_summary(capture: Capture, config: NeilfConfig) -> str | None:
             f"neilfpp prepare {shlex.quote(str(capture.root))} --out CAPTURE computes one and keeps the poses"
         )
     used = f"point cloud: {capture.point_cloud.name} supervises the geometry"
-    return f"{used}; --config.loss.point-cloud 0 switches this off"
+    return f"{used}; --config.host.loss.point-cloud 0 switches this off"
 
 
 def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
@@ -222,11 +223,11 @@ def _check_visible(host: MeshHost, capture: Capture, path: str) -> None:
 
 
 def _cloud_points(capture: Capture, config: NeilfConfig) -> OrientedPoints | None:
-    if config.loss.point_cloud == 0.0 or capture.point_cloud is None:
+    if config.host.loss.point_cloud == 0.0 or capture.point_cloud is None:
         return None
     points = load_point_cloud(capture.point_cloud, capture.normalization)
     # G is defined within the scene sphere only.
-    within = points[points.position.norm(dim=-1) < config.volume.radius]
+    within = points[points.position.norm(dim=-1) < config.background.radius]
     if not len(within):
         raise UserError(
             f"{capture.point_cloud}: no point lies in the scene",

@@ -214,7 +214,7 @@ def _update(
     loss, decibels, stopping, *mean_norms = means
     if all(math.isfinite(value) for value in (loss, *mean_norms)):
         optimizer.step()
-        limit_surface_width(run.model.host, run.config.volume, moment.position)
+        limit_surface_width(run.model.host, run.config, moment.position)
         run.skipped_in_a_row = 0
     else:
         _skip(run, total, dict(zip(norms, mean_norms, strict=True)), moment)

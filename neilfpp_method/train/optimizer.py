@@ -11,7 +11,7 @@ from torch import Tensor
 from neilfpp_method.hosts.base import Host, LimitsSurfaceWidth, StartsFromShape
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition, learning_rate, rate_factor, surface_width_limit
-from neilfpp_method.settings.types import OptimizerConfig, VolumeConfig
+from neilfpp_method.settings.types import NeilfConfig, OptimizerConfig
 
 __all__ = [
     "Stream",
@@ -98,13 +98,13 @@ def waiting_fields(model: NeilfModel, config: OptimizerConfig, position: StagePo
     return waiting
 
 
-def limit_surface_width(host: Host, config: VolumeConfig, position: StagePosition) -> None:
+def limit_surface_width(host: Host, config: NeilfConfig, position: StagePosition) -> None:
     """Limit the width of a host's surface to that of the schedule (`schedule.surface_width_limit`).
 
     Hosts whose surface has no soft layer that can be limited are not changed.
     """
     if isinstance(host, LimitsSurfaceWidth):
-        host.limit_surface_width(surface_width_limit(config, position))
+        host.limit_surface_width(surface_width_limit(config.host.volume, position))
 
 
 def seed_step(seed: int, step: int, rank: int = 0) -> None:

@@ -92,10 +92,10 @@ def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> 
     if isinstance(hull, str) and points is not None:
         cameras = [capture.scene_camera(view) for view in views[:: -(-len(views) // HULL_VIEWS)]]
         shape = f"the hull of {len(points.position)} points"
-        hull = find_cloud_hull(points, cameras, config.volume.radius)
+        hull = find_cloud_hull(points, cameras, model.host.radius)
     if isinstance(hull, str):
         return GeometryStart(reason=hull, warning=bool(outlines) or points is not None)
-    error = fit_distance(model.host.sdf_field, hull, config.volume.radius, config.train.seed, _rate(config))
+    error = fit_distance(model.host.sdf_field, hull, model.host.radius, config.train.seed, _rate(config))
     model.host.starts_from_shape = True
     return GeometryStart(shape, error)
 

@@ -52,7 +52,7 @@ def restore_surface(host: Host, position: StagePosition) -> bool:
     )
     if not is_due or not isinstance(host, VolSdfHost) or host.starts_from_shape:
         return False
-    radius = host.config.volume.radius
+    radius = host.radius
     axis = torch.linspace(-radius, radius, GRID, device=host.distance_grid.device)
     points = torch.cartesian_prod(axis, axis, axis)
     points = points[points.norm(dim=-1) < radius]

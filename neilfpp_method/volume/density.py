@@ -98,9 +98,9 @@ class LaplaceDensity(nn.Module):
         super().__init__()
         if not 0.0 < beta_floor < beta_init:
             raise UserError(
-                f"volume.beta_init = {beta_init}: β must start above its floor, {beta_floor}, which must be "
-                "above 0",
-                f"choose a volume.beta_init above {BETA_FLOOR}",
+                f"host.volume.beta_init = {beta_init}: β must start above its floor, {beta_floor}, which "
+                "must be above 0",
+                f"choose a host.volume.beta_init above {BETA_FLOOR}",
             )
         self.beta_floor = beta_floor
         self.above_floor = nn.Parameter(torch.tensor(beta_init - beta_floor))

@@ -4,8 +4,6 @@ are counted.
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -13,6 +11,7 @@ from benchmarks import joint
 from benchmarks.joint import fitted_model, rays_at_the_table, seconds_of, step_on, table
 from benchmarks.sampler import queries_per_ray
 from neilfpp_method.hosts import volsdf
+from neilfpp_method.settings.plain import changed
 from tests.scenes import sphere_model, tiny_config
 
 
@@ -27,9 +26,7 @@ def test_all_rays_meet_the_table():
 
 def test_a_field_is_fitted_to_the_table_and_copied_to_another_host(monkeypatch):
     monkeypatch.setattr(joint, "FIT_STEPS", 60)
-    config = dataclasses.replace(
-        tiny_config(), loss=dataclasses.replace(tiny_config().loss, hessian_joint=0.0)
-    )
+    config = changed(tiny_config(), {"host.loss.hessian_joint": 0.0})
     x = torch.rand(500, 3) * 1.6 - 0.8
     fitted = fitted_model(config)
     off = (fitted.host.sdf(x) - table(x)).abs().mean()

@@ -24,13 +24,16 @@ def small_paper():
     config, tiny = paper_mlp(), tiny_config()
     return dataclasses.replace(
         config,
-        host=VolSdfConfig(sdf=SdfConfig(layers=4, width=32, feature_width=8)),
+        host=VolSdfConfig(
+            sdf=SdfConfig(layers=4, width=32, feature_width=8),
+            volume=dataclasses.replace(tiny.host.volume, samples=32, beta_init=0.01),
+            loss=dataclasses.replace(config.host.loss, points="rays"),  # not drawn at random
+        ),
         radiance=dataclasses.replace(config.radiance, layers=2, width=32),
         brdf=dataclasses.replace(config.brdf, layers=4, width=32),
         light=dataclasses.replace(config.light, layers=4, width=32),
-        volume=dataclasses.replace(tiny.volume, samples=32, beta_init=0.01),
+        background=dataclasses.replace(config.background, radius=tiny.background.radius),
         shading=dataclasses.replace(config.shading, eval_samples=16, train_samples=16),
-        loss=dataclasses.replace(config.loss, points="rays"),  # not drawn at random
     )
 
 

@@ -139,4 +139,5 @@ def test_a_point_cloud_that_cannot_be_read(tmp_path, capfd, capture):
     shutil.copytree(capture, root)
     (root / "inputs" / "model" / "oriented_pcd.ply").write_bytes(b"ply")
     command = ["train", "--data", root, "--out", tmp_path / "run", "--preset", "tiny", "--device", "cpu"]
-    refused(capfd, [*command, "--config.loss.point-cloud", "0.1"], root, "oriented_pcd.ply", leaves=tmp_path)
+    command += ["--config.host.loss.point-cloud", "0.1"]
+    refused(capfd, command, root, "oriented_pcd.ply", leaves=tmp_path)

@@ -32,6 +32,8 @@ from tests.data.make_capture import make_capture
         (["train", "--data", "x", "--colour", "red"], ("--colour", "neilfpp train --help")),
         (["train", "--data", "x", "--config.train.rayss", "3"], ("did you mean --config.train.rays?",)),
         (["train", "--data", "x", "--config.train.rays", "few"], ("--config.train.rays", "'few'")),
+        (["train", "--data", "x", "--host", "mesh", "--config.host.loss.mask", "1"], ("--config.host.loss",)),
+        (["train", "--data", "x", "--config.loss.mask", "1"], ("did you mean --config.host.loss.mask?",)),
         (["train", "--response", "hdr"], ("--response", "linear", "srgb")),
         (["train", "--test-every", "often"], ("--test-every", "'often'")),
         (["train", "--config.train.rays", "1e3"], ("--config.train.rays: '1e3' is not a whole number",)),

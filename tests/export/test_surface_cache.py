@@ -17,6 +17,7 @@ import torch
 from neilfpp_method.export import surface_cache
 from neilfpp_method.export.surface_cache import ShadedSurface, extracted_surface, shaded_surface
 from neilfpp_method.relight.recovered import surface_of_run
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.train.run import Run, load_run
 from tests.calls import train_tiny
 from tests.train.small_runs import few_steps
@@ -98,9 +99,8 @@ def _weights(run: Run) -> Run:
 
 
 def _normal_radius(run: Run) -> Run:
-    radius = run.config.volume.normal_radius + 0.01
-    volume = dataclasses.replace(run.config.volume, normal_radius=radius)
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, volume=volume))
+    radius = run.config.host.volume.normal_radius + 0.01
+    return dataclasses.replace(run, config=changed(run.config, {"host.volume.normal_radius": radius}))
 
 
 @pytest.mark.parametrize("change", [_weights, _normal_radius])

@@ -9,7 +9,7 @@ from neilfpp_method.fields.background import InvertedSphere
 from neilfpp_method.settings.types import BackgroundConfig, FrequencyConfig, HashGridConfig
 
 WAVES, GRID = FrequencyConfig(), HashGridConfig(levels=4, log2_entries=10, max_resolution=32)
-CONFIG = BackgroundConfig(samples=8)
+CONFIG, SMALL = BackgroundConfig(radius=3.0, samples=8), BackgroundConfig(radius=2.0, samples=8)
 
 
 def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
@@ -26,7 +26,7 @@ def rays(radius: float, count: int = 20) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.parametrize("density", [-50.0, 0.0, 3.0, 50.0])
 def test_a_constant_color_does_not_depend_on_the_density(density, encoding):
     torch.manual_seed(0)
-    field = InvertedSphere(CONFIG, encoding, radius=3.0, scale=2.0)
+    field = InvertedSphere(CONFIG, encoding, scale=2.0)
     with torch.no_grad():
         field.trunk.layers[-1].bias[0] = density
         field.head.layers[-1].weight.zero_()
@@ -36,7 +36,7 @@ def test_a_constant_color_does_not_depend_on_the_density(density, encoding):
 
 
 def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
-    field = InvertedSphere(CONFIG, WAVES, radius=2.0, scale=1.0).double()
+    field = InvertedSphere(SMALL, WAVES, scale=1.0).double()
     seen = []
     field.position.register_forward_hook(lambda _, given, __: seen.append(given[0]))
     origins, directions = rays(2.0)
@@ -52,7 +52,7 @@ def test_samples_lie_on_the_rays_in_equal_steps_of_inverse_radius():
 
 
 def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
-    waves, grid = (InvertedSphere(CONFIG, encoding, radius=2.0, scale=1.0) for encoding in (WAVES, GRID))
+    waves, grid = (InvertedSphere(SMALL, encoding, scale=1.0) for encoding in (WAVES, GRID))
     charts, contracted = [], []
     waves.position.register_forward_hook(lambda _, given, __: charts.append(given[0]))
     grid.position.register_forward_hook(lambda _, given, __: contracted.append(given[0]))
@@ -70,21 +70,21 @@ def test_a_hash_grid_encodes_the_contraction_of_the_same_points():
 
 @pytest.mark.parametrize(("encoding", "layers", "width"), [(WAVES, 8, 256), (GRID, 2, 64)])
 def test_the_network_has_the_published_size(encoding, layers, width):
-    trunk = InvertedSphere(CONFIG, encoding, radius=2.0, scale=1.0).trunk
+    trunk = InvertedSphere(SMALL, encoding, scale=1.0).trunk
     assert [layer.out_features for layer in trunk.layers] == [width] * layers + [1 + width]
 
 
 @pytest.mark.parametrize("start", [(0.25, 0.2, 0.15), (1.0, 0.5, 0.04)])
 def test_the_field_starts_with_the_given_color(start):
     torch.manual_seed(0)
-    field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.tensor(start))
+    field = InvertedSphere(CONFIG, WAVES, scale=2.0, start=torch.tensor(start))
     color = field(*(t.float() for t in rays(3.0)))
     torch.testing.assert_close(color, torch.tensor(start).expand(20, 3), rtol=0.02, atol=1e-3)
 
 
 @pytest.mark.parametrize("start", [0.0, 2.0, 5.0])
 def test_a_color_out_of_range_does_not_stop_training(start):
-    field = InvertedSphere(CONFIG, WAVES, radius=3.0, scale=2.0, start=torch.full((3,), start))
+    field = InvertedSphere(CONFIG, WAVES, scale=2.0, start=torch.full((3,), start))
     color = field(*(t.float() for t in rays(3.0)))
     color.sum().backward()
     assert ((color > 0.01) & (color < 1.99)).all()
@@ -96,7 +96,7 @@ def test_two_samples_by_hand():
     each half.
     """
     torch.manual_seed(0)
-    field = InvertedSphere(BackgroundConfig(samples=2), WAVES, radius=4.0, scale=1.0)
+    field = InvertedSphere(BackgroundConfig(radius=4.0, samples=2), WAVES, scale=1.0)
     with torch.no_grad():
         field.trunk.layers[-1].weight[0].zero_()
         field.trunk.layers[-1].bias[0] = 0  # softplus(0) = ln 2

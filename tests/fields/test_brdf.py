@@ -20,7 +20,7 @@ SMALL = {
 def test_starts_at_the_configured_material(name):
     torch.manual_seed(0)
     config = preset(name)
-    material = BrdfField(config.brdf, config.encoding, config.volume.radius)(positions(200).float())
+    material = BrdfField(config.brdf, config.encoding, config.background.radius)(positions(200).float())
     starts = {
         "base_color": (3, config.brdf.initial_base_color),
         "roughness": (1, 0.5),

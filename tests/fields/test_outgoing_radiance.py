@@ -25,7 +25,7 @@ def test_starts_near_the_given_radiance_and_below_its_scale(name, scale, asked, 
     config = preset(name)
     width = config.host.sdf.feature_width
     color = OutgoingRadianceField(
-        config.radiance, config.encoding, width, config.volume.radius, scale, asked
+        config.radiance, config.encoding, width, config.background.radius, scale, asked
     )(*inputs(width))
     assert color.shape == (50, 3)
     assert color.min() > 0

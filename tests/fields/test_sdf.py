@@ -32,7 +32,7 @@ def worn_in(encoding: str, noise: float = 0.1) -> SdfField:
 def test_starts_as_a_sphere(name):
     torch.manual_seed(0)
     config = preset(name)
-    field = SdfField(config.host.sdf, config.encoding, config.volume.radius)
+    field = SdfField(config.host.sdf, config.encoding, config.background.radius)
     directions = torch.nn.functional.normalize(torch.randn(500, 3))
     for radius, error in ((0.1, 0.15), (0.3, 0.1), (0.6, 0.06), (1.0, 0.08), (1.75, 0.15)):
         with torch.no_grad():

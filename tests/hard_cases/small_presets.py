@@ -18,7 +18,7 @@ SMALLER = {
     "brdf.width": 16,
     "light.layers": 4,
     "light.width": 16,
-    "volume.samples": 36,
+    "host.volume.samples": 36,
 }
 """Smaller fields, and fewer samples per ray."""
 

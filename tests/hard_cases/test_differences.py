@@ -22,6 +22,7 @@ import neilfpp_method.model as model_module
 from neilfpp_method.hosts.mesh import MeshHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, active_losses, weigh
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import fixed_geometry
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
@@ -55,15 +56,16 @@ def samples_stay(monkeypatch):
 def small_config(light: str, mode: str = "off") -> NeilfConfig:
     """Gradients are not scaled, and every ray with any weight counts as a hit."""
     config = tiny_config() if light == "free" else solved_light(tiny_config())
-    return dataclasses.replace(
+    return changed(
         config,
-        # L_Hess is computed about hits that count as constants, so its slope is not that of a difference.
-        loss=dataclasses.replace(
-            config.loss, position_gradient=1.0, normal_gradient=1.0, hessian=0.0, hessian_joint=0.0
-        ),
-        volume=dataclasses.replace(config.volume, normal_radius=0.0),
-        light=dataclasses.replace(config.light, inter_reflection=mode),
-        shading=dataclasses.replace(config.shading, hit_share=0.3),
+        {
+            "loss": {"position_gradient": 1.0, "normal_gradient": 1.0},
+            # L_Hess is computed about hits that count as constants, so its slope is not that of a difference.
+            "host.loss": {"hessian": 0.0, "hessian_joint": 0.0},
+            "host.volume.normal_radius": 0.0,
+            "light.inter_reflection": mode,
+            "shading.hit_share": 0.3,
+        },
     )
 
 

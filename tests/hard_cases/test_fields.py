@@ -107,7 +107,7 @@ def test_incident_radiance_is_positive_and_bounded(name, dtype):
 def test_background_from_the_center_and_from_the_rim(name, dtype):
     """Rays from the origin, along a radius, along a tangent, and from a hair outside the sphere."""
     torch.manual_seed(0)
-    field = InvertedSphere(BackgroundConfig(), preset(name).encoding, radius=3.0, scale=3.0).to(dtype)
+    field = InvertedSphere(BackgroundConfig(radius=3.0), preset(name).encoding, scale=3.0).to(dtype)
     origins = torch.tensor([[0.0, 0.0, 0.0], [2.9, 0.0, 0.0], [3.0, 0.0, 0.0], [3.01, 0.0, 0.0]], dtype=dtype)
     directions = torch.tensor(
         [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 0.0]], dtype=dtype

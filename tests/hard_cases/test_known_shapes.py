@@ -44,10 +44,13 @@ def settings() -> NeilfConfig:
     config = tiny_config()
     return dataclasses.replace(
         config,
-        host=dataclasses.replace(config.host, sdf=dataclasses.replace(config.host.sdf, width=32)),
+        host=dataclasses.replace(
+            config.host,
+            sdf=dataclasses.replace(config.host.sdf, width=32),
+            volume=dataclasses.replace(config.host.volume, beta_init=0.05, samples=24),
+        ),
         encoding=HashGridConfig(levels=4, log2_entries=13, sdf_log2_entries=13, max_resolution=64),
         radiance=dataclasses.replace(config.radiance, width=32),
-        volume=dataclasses.replace(config.volume, beta_init=0.05, samples=24),
     )
 
 
@@ -57,7 +60,7 @@ def with_weak_masks() -> NeilfConfig:
     The weight of `fast` suits a start from the visual hull; from a ball it carves thin and small shapes away
     before they have been found (docs/stability.md).
     """
-    return changed(settings(), {"loss.mask": 0.1})
+    return changed(settings(), {"host.loss.mask": 0.1})
 
 
 def batch_of(seen: Seen, rows: np.ndarray | slice) -> PixelBatch:

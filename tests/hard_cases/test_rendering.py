@@ -9,6 +9,7 @@ import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.schedule import Stage, StagePosition, active_losses, weigh
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step
 from neilfpp_method.train.vanished import restore_surface
@@ -41,10 +42,9 @@ def beside_the_scene():
 @pytest.mark.parametrize("background", ["constant", "none", "inverted_sphere"])
 @pytest.mark.parametrize("mode", ["soft", "hard"])
 def test_every_stage_stays_finite(batch, beta, background, mode):
-    config = tiny_config()
+    config = changed(tiny_config(), {"host.volume.beta_init": beta})
     config = dataclasses.replace(
         config,
-        volume=dataclasses.replace(config.volume, beta_init=beta),
         shading=dataclasses.replace(config.shading, hit_share=1e-3),  # every ray with any weight is shaded
         light=dataclasses.replace(config.light, inter_reflection=mode),
     )
@@ -136,9 +136,7 @@ def fifty_steps(batch: PixelBatch, stage: Stage, odd: int) -> dict[str, torch.Te
 def test_ten_thousand_steps_with_beta_at_its_floor():
     """The surface is restored when it vanishes, as in the training loop."""
     config = tiny_config()
-    model = sphere_model(
-        dataclasses.replace(config, volume=dataclasses.replace(config.volume, beta_init=1.0001e-4))
-    )
+    model = sphere_model(changed(config, {"host.volume.beta_init": 1.0001e-4}))
     model.freeze_for(Stage.SDF_INIT)
     optimizer = make_optimizer(model, config.optimizer)
     beta = [group for group in optimizer.param_groups if group["name"] == "beta"]

@@ -62,7 +62,7 @@ SMALLER = {
     "light.environment_height": 16,
     "light.fit.points": 512,
     "light.fit.every": 50,
-    "volume.samples": 24,
+    "host.volume.samples": 24,
     "shading.train_samples": 32,
     "train.sdf_steps": 250,
     "train.material_steps": 250,
@@ -72,7 +72,7 @@ SMALLER = {
 """Differences from the preset `fast`: smaller fields, fewer rays and steps."""
 
 PAPER = {
-    "volume.samples": 24,
+    "host.volume.samples": 24,
     "shading.train_samples": 96,
     "train.sdf_steps": 300,
     "train.material_steps": 400,
@@ -344,7 +344,7 @@ def test_the_inside_of_a_bowl_is_recovered_from_its_hull(tmp_path):
 def test_a_shape_that_fills_every_image_is_recovered_with_its_cloud(tmp_path, name):
     shape, case = shapes.SHAPES[name], WITHOUT_OUTLINE[name]
     cloud = shapes.photograph(shape, 2000, seed=0, **case.camera)
-    changes = {**SURFACE_ONLY, "loss.point_cloud": 1.0}
+    changes = {**SURFACE_ONLY, "host.loss.point_cloud": 1.0}
     run = trained(look_at_shape(shape), tmp_path, changes=changes, cloud=cloud, masks=False, **case.camera)
     truth = shapes.photograph(shape, 2000, seed=1, **{**case.camera, "views": 40})
     check([compare(look(run.model), truth)], asdict(case.largest))

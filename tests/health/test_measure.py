@@ -23,7 +23,7 @@ PIXELS = sphere_batch(256, spread=0.1)
 
 def with_width(width: float) -> NeilfModel:
     """A model whose surface is a sphere of this width β."""
-    return sphere_model(changed(tiny_config(), {"volume.beta_init": width}))
+    return sphere_model(changed(tiny_config(), {"host.volume.beta_init": width}))
 
 
 def found(model: NeilfModel) -> dict[str, str]:

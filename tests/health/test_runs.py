@@ -22,7 +22,7 @@ from tests.data.make_capture import make_capture
 from tests.scenes import tiny_config
 from tests.train.small_runs import short_light_fits, small_training, solved_light
 
-SOFT = {"volume.beta_init": 0.1, "volume.beta_final": 0.0}
+SOFT = {"host.volume.beta_init": 0.1, "host.volume.beta_final": 0.0}
 """A width of the surface that is only learned, with the learning rate of `fast`: it hardly falls."""
 
 
@@ -52,7 +52,7 @@ def sdf_init(capture: Path, out: Path, **changes: object):
 def test_a_surface_that_stays_soft_is_reported_once_at_half_of_sdf_init(capture, tmp_path):
     run, warned, said = sdf_init(capture, tmp_path, **SOFT)
     assert [line[:8] for line in warned] == [f"step {SURFACE_FROM * 60:.0f}:"]
-    assert "volume.beta_final to 0.002" in warned[0]
+    assert "host.volume.beta_final to 0.002" in warned[0]
     assert said == []
     (finding,) = run.watch.findings.values()
     assert (finding.case, finding.step) == ("beta_stuck", 30)
@@ -63,14 +63,14 @@ def test_a_surface_that_stays_soft_is_reported_once_at_half_of_sdf_init(capture,
 
 
 def test_the_remedy_of_a_soft_surface_helps(capture, tmp_path):
-    run, warned, _ = sdf_init(capture, tmp_path, **(SOFT | {"volume.beta_final": 0.002}))
+    run, warned, _ = sdf_init(capture, tmp_path, **(SOFT | {"host.volume.beta_final": 0.002}))
     assert warned == []
     assert run.watch.health.verdict == "sound"
 
 
 def test_a_surface_that_becomes_sharp_late_is_reported_and_then_said_to_have_recovered(capture, tmp_path):
     """The bound of β is 0.04 after half of SDF init, 0.02 after two thirds, and 0.005 at its end."""
-    late = {"volume.beta_init": 0.3, "volume.beta_final": 0.005}
+    late = {"host.volume.beta_init": 0.3, "host.volume.beta_final": 0.005}
     run, warned, said = sdf_init(capture, tmp_path, **late)
     assert len(warned) == 1
     assert warned[0].startswith("step 30: the surface has not become sharp")

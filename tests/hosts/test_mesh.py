@@ -210,18 +210,6 @@ def test_a_ray_between_two_triangles_hits_the_one_ahead():
 # ---------------------------------------------------------------------------------------------- light between
 
 
-def test_normals_of_a_noisy_mesh_are_smoothed_if_configured():
-    rough = SPHERE.copy()
-    rough.vertices += np.random.default_rng(0).normal(0, 0.002, rough.vertices.shape)
-    rays, errors = rays_at(500, 0.3), {}
-    for radius in (0.0, 0.15):
-        host = mesh_host(rough, volume=dataclasses.replace(mesh_config().volume, normal_radius=radius))
-        hits = host.render(rays)
-        normal = host.smooth_normals(hits.position, hits.normal)
-        errors[radius] = 1 - (normal * normalize(hits.position, dim=-1)).sum(-1)
-    assert errors[0.15].median() < errors[0.0].median() / 8
-
-
 def two_planes() -> trimesh.Trimesh:
     """A floor at z = 0 that faces up, and a ceiling at z = 0.5 that faces down."""
     corners = [[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
 import torch
 
@@ -11,6 +9,7 @@ from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.incident import traced
 from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import changed
 from neilfpp_method.volume import empty_space
 from neilfpp_method.volume.samplers import SampleCounts
 from tests.scenes import sphere_batch, tiny_config
@@ -18,11 +17,8 @@ from tests.scenes import sphere_batch, tiny_config
 
 def host(skip: bool = True) -> VolSdfHost:
     torch.manual_seed(0)
-    config = tiny_config()
-    return VolSdfHost(
-        dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip)),
-        SceneFacts("linear", 0.2, 3.0, "constant"),
-    )
+    config = changed(tiny_config(), {"host.volume.skip_empty": skip})
+    return VolSdfHost(config, SceneFacts("linear", 0.2, 3.0, "constant"))
 
 
 @pytest.fixture(autouse=True)

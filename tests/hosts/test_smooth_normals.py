@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import torch
 from torch.nn.functional import normalize
 
 from neilfpp_method.hosts.smooth_normals import NEIGHBORS, smooth_normals
+from neilfpp_method.settings.plain import changed
 from tests.scenes import sphere_batch, sphere_model, tiny_config
 
 RADIUS = 0.15
@@ -70,9 +70,7 @@ def test_an_empty_batch_of_points():
 def test_a_radius_of_zero_evaluates_no_neighbors():
     config = tiny_config()
     for radius, expected in ((0.0, 0), (RADIUS, NEIGHBORS)):
-        model = sphere_model(
-            dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=radius))
-        )
+        model = sphere_model(changed(config, {"host.volume.normal_radius": radius}))
         hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
         asked = []
         original = model.host.sdf_field.with_gradient
@@ -84,10 +82,7 @@ def test_a_radius_of_zero_evaluates_no_neighbors():
 
 
 def test_the_gradient_is_that_of_the_hit_normals():
-    config = tiny_config()
-    model = sphere_model(
-        dataclasses.replace(config, volume=dataclasses.replace(config.volume, normal_radius=RADIUS))
-    )
+    model = sphere_model(changed(tiny_config(), {"host.volume.normal_radius": RADIUS}))
     hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
     normal = hits.normal.clone().requires_grad_()
     weight = torch.randn_like(normal)

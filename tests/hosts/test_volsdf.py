@@ -13,6 +13,7 @@ from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularized
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.settings.facts import SceneFacts
+from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.structures import OrientedPoints, RayBatch
 from neilfpp_method.volume.density import laplace_density
@@ -24,10 +25,7 @@ RADIUS = 0.6
 
 def thin_surface(background: str = "constant") -> VolSdfHost:
     """The sphere with a thin surface layer."""
-    config = tiny_config()
-    config = dataclasses.replace(
-        config, volume=dataclasses.replace(config.volume, beta_init=2e-3, samples=64)
-    )
+    config = changed(tiny_config(), {"host.volume": {"beta_init": 2e-3, "samples": 64}})
     return sphere_model(config, background=background).eval().host
 
 
@@ -66,15 +64,14 @@ def test_a_miss_has_the_background_color(sharp):
 
 @pytest.mark.parametrize("skip_empty", [False, True])
 def test_without_a_background_the_scene_sphere_has_the_radiance_of_r(skip_empty):
-    config = tiny_config()
-    config = dataclasses.replace(config, volume=dataclasses.replace(config.volume, skip_empty=skip_empty))
+    config = changed(tiny_config(), {"host.volume.skip_empty": skip_empty})
     host = sphere_model(config, background="none").train().host
     host.radiance_field.forward = lambda x, wo, normal, feature: x.norm(dim=-1, keepdim=True).expand(
         -1, 3
     )  # how far out
     rays = RayBatch(torch.tensor([[0.0, 1.2, -1.0], [0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]] * 2))
     past, onto = host.render(rays).color[:, 0]
-    assert past.item() == pytest.approx(config.volume.radius, abs=1e-3)
+    assert past.item() == pytest.approx(config.background.radius, abs=1e-3)
     assert onto.item() == pytest.approx(RADIUS, abs=0.1)
     assert host.render(rays).opacity[0] < 1e-3  # painted by R, but no surface of the object
 
@@ -101,8 +98,10 @@ def test_the_opacity_of_rays_that_graze_a_sphere_is_accurate(name, beta, error, 
     """The rendered opacity, not the sampler's bound: for rays that a thin layer covers in part, with an exact
     sphere.
     """
-    volume = dataclasses.replace(preset(name).volume, beta_init=beta)
-    host = sphere_model(tiny_config(volume=volume)).train(training).host
+    named = preset(name)
+    volume = {**to_dict(named.host.volume), "beta_init": beta}
+    config = changed(tiny_config(), {"host.volume": volume, "background.radius": named.background.radius})
+    host = sphere_model(config).train(training).host
     exact = lambda x: x.norm(dim=-1) - RADIUS  # noqa: E731
     host.sdf_field.forward = exact
     host.sdf_field.with_gradient = lambda x: SdfSample(exact(x), normalize(x, dim=-1), torch.zeros(len(x), 4))
@@ -142,8 +141,7 @@ def test_regularizers_cover_the_whole_scene():
     """For G = c · x the losses are known at every point, so their means and counts show which points are
     used.
     """
-    config = tiny_config()
-    config = dataclasses.replace(config, loss=dataclasses.replace(config.loss, points="scene"))
+    config = changed(tiny_config(), {"host.loss.points": "scene"})
     host, batch, asked = sphere_model(config).train().host, sphere_batch(16), []
     slope = torch.tensor([0.0, 0.0, 2.0])
     host.sdf_field.with_gradient = lambda x: (
@@ -155,7 +153,7 @@ def test_regularizers_cover_the_whole_scene():
     assert points is curved
     assert points.shape == (3 * 16, 3)  # 8192 about the object and 4096 in the scene for 4096 rays
     assert points[:32].abs().max() <= 1.0
-    assert 1.0 < points[32:].abs().max() <= config.volume.radius
+    assert 1.0 < points[32:].abs().max() <= config.background.radius
     assert terms["eikonal"].values.shape == (4 * 16,)  # one sample of each ray as well
     assert terms["eikonal"].mean().item() == pytest.approx(1.0)
     torch.testing.assert_close(terms["surface"].values, 10.0 / (torch.pi * (100.0 + (points @ slope) ** 2)))

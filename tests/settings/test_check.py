@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -10,16 +11,38 @@ from neilfpp_method.attach import attach_neilf
 from neilfpp_method.errors import UserError
 from neilfpp_method.settings.check import check_config
 from neilfpp_method.settings.presets import PRESETS, fixed_geometry, free_light, preset
-from neilfpp_method.settings.types import NeilfConfig
 from tests.scenes import tiny_config
 
 
-def with_setting(config: NeilfConfig, room: str, **settings: object) -> NeilfConfig:
-    return replace(config, **{room: replace(getattr(config, room), **settings)})
+def with_setting(config: Any, room: str, **settings: object) -> Any:
+    """The same settings with others in a group with a dotted name, without the checks of `changed`."""
+    part, _, rest = room.partition(".")
+    group = getattr(config, part)
+    return replace(
+        config, **{part: with_setting(group, rest, **settings) if rest else replace(group, **settings)}
+    )
 
 
 WRONG = {
-    "a surface of negative width": (preset("fast"), "volume", {"beta_final": -0.1}, "beta-final is -0.1"),
+    "a surface of negative width": (
+        preset("fast"),
+        "host.volume",
+        {"beta_final": -0.1},
+        r"--config\.host\.volume\.beta-final is -0\.1; set it to 0 \(no bound\) or more",
+    ),
+    "a density without width": (
+        preset("fast"),
+        "host.volume",
+        {"beta_init": 0.0},
+        "host.volume.beta-init is 0.0; set it to a number above 0",
+    ),
+    "no samples": (preset("fast"), "host.volume", {"samples": 0}, "host.volume.samples is 0; set it to 1"),
+    "a negative weight of a loss of G": (
+        preset("fast"),
+        "host.loss",
+        {"hessian_joint": -1.0},
+        "--config.host.loss.hessian-joint is -1.0; set it to 0 or more",
+    ),
     "no incident directions": (
         preset("fast"),
         "shading",
@@ -50,7 +73,7 @@ WRONG = {
     ),
     "a rate that is no number": (preset("fast"), "optimizer", {"light": float("nan")}, "light is nan"),
     "a negative weight": (preset("fast"), "loss", {"volume": -1.0}, "loss.volume is -1.0"),
-    "a scene without extent": (preset("fast"), "volume", {"radius": 0.0}, "volume.radius is 0.0"),
+    "a scene without extent": (preset("fast"), "background", {"radius": 0.0}, "background.radius is 0.0"),
 }
 
 

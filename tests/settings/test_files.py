@@ -41,10 +41,11 @@ def test_words_and_numbers_of_yaml(tmp_path):
 
 def test_a_file_changes_a_preset_and_options_override_it(tmp_path):
     path = written(
-        tmp_path, "preset: paper-ngp\ntrain:\n  rays: 64\nlight.inter-reflection: off\nloss.eikonal: 1e-2\n"
+        tmp_path,
+        "preset: paper-ngp\ntrain:\n  rays: 64\nlight.inter-reflection: off\nhost.loss.eikonal: 1e-2\n",
     )
     config = settings_of("--config", str(path))
-    changes = {"train.rays": 64, "light.inter_reflection": "off", "loss.eikonal": 0.01}
+    changes = {"train.rays": 64, "light.inter_reflection": "off", "host.loss.eikonal": 0.01}
     assert config == changed(preset("paper-ngp"), changes)
     assert (
         settings_of(f"--config={path}", "--preset", "fast").train.sdf_steps == preset("fast").train.sdf_steps

@@ -78,6 +78,14 @@ def test_a_new_kind_has_its_own_settings():
     )
 
 
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_given_mesh_has_no_settings_of_recovered_geometry(name):
+    values = to_dict(fixed_geometry(preset(name)))
+    assert values["host"] == {"kind": "mesh", "path": None}
+    assert "volume" not in values
+    assert not {"eikonal", "points", "mask"} & values["loss"].keys()
+
+
 @pytest.mark.parametrize(
     ("values", "complaint"),
     [
@@ -95,6 +103,11 @@ def test_a_new_kind_has_its_own_settings():
         ({"background.color": [1.0, 2.0, "red"]}, "config.background.color: 'red' where float belongs"),
         ({"light.inter_reflection": "soft"}, "config.light.inter_reflection: 'soft' is not a choice"),
         ({"light.inter_reflection": False}, "config.light.inter_reflection: 'False' is not a choice"),
+        ({"host.kind": "mesh", "host.volume.samples": 3}, "config.host: unknown setting 'volume'"),
+        ({"host.kind": "mesh", "host.loss.eikonal": 1.0}, "config.host: unknown setting 'loss'"),
+        # Names of earlier versions.
+        ({"volume.samples": 3}, "config: unknown setting 'volume'"),
+        ({"loss.eikonal": 1.0}, "config.loss: unknown setting 'eikonal'"),
     ],
 )
 def test_the_wrong_setting_is_named(values, complaint):

@@ -39,12 +39,12 @@ def compare_everything(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def with_patches(**train: int) -> NeilfConfig:
-    values = {"loss.patches": 0.5, "shading.hit_share": 0.01, "host.sdf.start": "sphere"}
+    values = {"host.loss.patches": 0.5, "shading.hit_share": 0.01, "host.sdf.start": "sphere"}
     return changed(small_config(**train), values)
 
 
 def test_the_presets_for_photographs_compare_patches():
-    assert all(preset(name).loss.patches > 0 for name in ("fast", "balanced", "best"))
+    assert all(preset(name).host.loss.patches > 0 for name in ("fast", "balanced", "best"))
 
 
 def test_images_are_kept_only_while_they_are_compared(tmp_path, ring):
@@ -55,7 +55,7 @@ def test_images_are_kept_only_while_they_are_compared(tmp_path, ring):
         assert (model.host.patch_views is not None) is shown
     show_patches(model, pixels, Stage.SDF_INIT)
     assert model.losses(pixels.sample(64), Stage.SDF_INIT)["patches"].values.any()
-    model.use(changed(with_patches(), {"loss.patches": 0.0}))
+    model.use(changed(with_patches(), {"host.loss.patches": 0.0}))
     show_patches(model, pixels, Stage.SDF_INIT)
     assert model.host.patch_views is None
     assert "patches" not in model.losses(pixels.sample(64), Stage.SDF_INIT)

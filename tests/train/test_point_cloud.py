@@ -28,8 +28,9 @@ def built(capture, config):
 
 def test_the_cloud_is_in_the_loss_of_fast(capture):
     config = preset("fast")
-    assert config.loss.point_cloud > 0
-    model, pixels = built(capture, changed(tiny_config(), {"loss.point_cloud": config.loss.point_cloud}))
+    weight = config.host.loss.point_cloud
+    assert weight > 0
+    model, pixels = built(capture, changed(tiny_config(), {"host.loss.point_cloud": weight}))
     terms = model.losses(pixels.sample(8), Stage.SDF_INIT)
     # The initial sphere does not have the radius 0.8, so the points are not on it.
     assert terms["point_cloud"].values.max() > 0.05
@@ -38,12 +39,12 @@ def test_the_cloud_is_in_the_loss_of_fast(capture):
 
 def test_a_capture_without_a_cloud_has_no_loss_on_it(capture):
     without = dataclasses.replace(capture, point_cloud=None)
-    config = changed(tiny_config(), {"loss.point_cloud": 0.1})
+    config = changed(tiny_config(), {"host.loss.point_cloud": 0.1})
     model, pixels = built(without, config)
     assert "point_cloud" not in model.losses(pixels.sample(8), Stage.SDF_INIT)
     assert f"neilfpp prepare {without.root} --out CAPTURE" in cloud_summary(without, config)
 
 
 def test_no_message_if_the_settings_use_no_cloud(capture):
-    assert cloud_summary(capture, changed(preset("fast"), {"loss.point_cloud": 0.0})) is None
+    assert cloud_summary(capture, changed(preset("fast"), {"host.loss.point_cloud": 0.0})) is None
     assert cloud_summary(capture, fixed_geometry(preset("fast"))) is None

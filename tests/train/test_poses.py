@@ -178,8 +178,8 @@ def test_noisy_poses_are_corrected(tmp_path, degrees):
             "encoding.sdf_log2_entries": 13,
             "encoding.max_resolution": 64,
             "radiance.width": 32,
-            "volume.beta_init": 0.05,
-            "volume.samples": 24,
+            "host.volume.beta_init": 0.05,
+            "host.volume.samples": 24,
             "train.pose_fits": 8,
         },
     )

@@ -20,7 +20,8 @@ from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
-from neilfpp_method.settings.types import NeilfConfig, VolSdfConfig
+from neilfpp_method.settings.plain import changed
+from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import command, start
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.checkpoint import last_checkpoint, save_checkpoint
@@ -51,10 +52,7 @@ def masked(tmp_path: Path) -> Path:
 
 
 def settings(begin: str = "hull") -> NeilfConfig:
-    config = small_config()
-    return dataclasses.replace(
-        config, host=VolSdfConfig(sdf=dataclasses.replace(config.host.sdf, start=begin))
-    )
+    return changed(small_config(), {"host.sdf.start": begin})
 
 
 def started(root: Path, config: NeilfConfig) -> tuple[NeilfModel, GeometryStart]:
@@ -144,7 +142,7 @@ def test_masks_of_test_views_are_not_used(masked):
 
 
 def without_points(config: NeilfConfig) -> NeilfConfig:
-    return dataclasses.replace(config, loss=dataclasses.replace(config.loss, point_cloud=0.0))
+    return changed(config, {"host.loss.point_cloud": 0.0})
 
 
 def test_without_masks_it_is_the_hull_of_the_points(tmp_path):

@@ -151,10 +151,10 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
 
 
 def test_rays_that_skip_empty_space_are_cut_less_often():
-    skipping = sample_counts(preset("fast").volume)
+    skipping = sample_counts(preset("fast").host.volume)
     assert skipping == SampleCounts(cuts=64, rounds=2, rendered=32)
     assert skipping.of_narrowed_rays() == SampleCounts(cuts=32, rounds=2, rendered=32)
-    assert sample_counts(preset("paper-mlp").volume) == COUNTS
+    assert sample_counts(preset("paper-mlp").host.volume) == COUNTS
 
 
 def test_the_bound_shows_when_the_rounds_were_too_few():
