@@ -34,6 +34,7 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.optimizer import seed_step
+from neilfpp_method.volume.samplers import sample_counts
 
 __all__ = ["Growth", "StraightLine", "straight_line"]
 
@@ -98,6 +99,7 @@ def step_seconds(model: NeilfModel, config: NeilfConfig, rays: int) -> float:
     network.
     """
     model.config = model.host.config = config
+    model.host.sample_counts = sample_counts(config.host.volume)
     return seconds_of(step_on(model, rays_at_the_table(rays)))
 
 
