@@ -32,7 +32,7 @@ def _yaml(folder: Path) -> list[Path]:
     (folder / "all.yaml").write_text(yaml.safe_dump(to_dict(preset("fast"))))
     (folder / "some.yaml").write_text("train: {rays: 512, sdf_steps: 100}\nloss.volume: 1.0 # a comment\n")
     (folder / "tags.yaml").write_text(
-        'train: {rays: !!int "512"}\nloss: {mask: &a !!float 5e-4, hessian: *a}\n'
+        'train: {rays: !!int "512"}\nhost.loss: {mask: &a !!float 5e-4, hessian: *a}\n'
     )
     (folder / "all.json").write_text(json.dumps({"format": FORMAT, "config": to_dict(preset("paper-ngp"))}))
     return sorted(folder.iterdir())
