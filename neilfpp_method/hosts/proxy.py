@@ -333,7 +333,8 @@ class SurfaceProxy(nn.Module):
         end = start[rows] + traced.distance[rows, None] * directions
         cosine = -(grid_normal(grid, self.radius, end) * directions).sum(-1)
         rest = (look_up(grid, self.radius, end) / cosine.clamp_min(MIN_COSINE)).clamp(-self.cell, self.cell)
-        return GridHits((entry.distance + traced.distance).index_add(0, rows, rest), hit)
+        # A ray that starts inside a wall, by the error of the grid, would have to go back to its surface.
+        return GridHits((entry.distance + traced.distance).index_add(0, rows, rest).clamp_min(0.0), hit)
 
     def _entry(self, rays: RayBatch) -> CubeEntry:
         direction = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)

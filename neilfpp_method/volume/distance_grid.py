@@ -86,8 +86,8 @@ def trace_grid(
 
     Rays from a surface start exactly at their points (`leaves_surface`). If they started above them, along
     the normal, every shadow would move towards the object that casts it, by the height times tan θ. Until
-    such a ray is a quarter of a cell above all surfaces, it hits only where the grid shows it to be that much
-    deeper than at its start, or than 0: behind a wall next to it, for example.
+    such a ray is a quarter of a cell above all surfaces, it hits only where it is inside by a quarter of a
+    cell, and deeper by as much than at its start: for example in a wall next to it.
 
     On a CPU each ray runs in a compiled loop. On other devices all rays take all steps together, without
     synchronisation.

@@ -81,6 +81,15 @@ def test_distances_are_off_by_less_than_a_cell(still):
     assert found.told.distance[~found.told.hit].isinf().all()
 
 
+def test_no_distance_is_negative(still):
+    """Also of rays that start a little inside the ball or the table, by the error of a host."""
+    generator = torch.Generator().manual_seed(5)
+    hits = CallableHost(TableTop()).render(camera_rays_above(2000, seed=99))
+    hits = hits[hits.is_hit(0.8)]
+    wi = normalize(torch.randn(len(hits), 16, 3, generator=generator), dim=-1)
+    assert (still.scene_light(hits.position - 0.5 * still.cell * hits.normal, wi).distance >= 0).all()
+
+
 def test_incident_light_is_the_observed_radiance(still):
     found = compare(TableTop(), still)
     both = found.told.hit & found.true.isfinite()
