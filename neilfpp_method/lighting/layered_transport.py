@@ -97,7 +97,8 @@ def light_layers(
 ) -> LightLayers:
     """The layers of outgoing radiance that a known map, known lamps and the scene cause.
 
-    No transport matrix is stored, so that the map may have any size. Arguments as in `texel_layers`.
+    No transport matrix is stored, but a ray from each point towards each texel. Arguments as in
+    `texel_layers`.
     """
     environment, lamps = light.light, light.lamps
     parts = [

@@ -37,6 +37,10 @@ COLOR_SCALE = 0.2
 """Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
 of the same look are often of one material.
 """
+MAX_ROWS = 64
+"""Rows to which a finer map is reduced: a given map may have a million texels, and from every place a ray is
+traced towards each texel.
+"""
 MIN_ROUGHNESS = 0.05
 """Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
 
@@ -108,7 +112,7 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     """
     places = places.only_shown()
     shared = places.shared_points()
-    light = LightModel(model.light, model.lamps)
+    light = LightModel(model.light.at_most(MAX_ROWS), model.lamps)
     draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DIRECTIONS)]
     layers = LightLayers(
         torch.stack([drawn.light for drawn in draws]).mean(0),

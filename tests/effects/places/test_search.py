@@ -20,12 +20,13 @@ from neilfpp_method.effects.places.search import (
     teach,
 )
 from neilfpp_method.fields.brdf import BrdfField
+from neilfpp_method.fields.direction_map import interpolate, map_directions
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.presets import preset
 from neilfpp_method.shading import LOBES
-from neilfpp_method.structures import Material
+from neilfpp_method.structures import Material, SceneLight
 from tests.effects.balls import ball, sky
 from tests.scenes import sphere_model
 
@@ -162,3 +163,26 @@ def test_a_field_learns_the_material_where_it_differs_and_keeps_it_elsewhere():
     for name in ("base_color", "roughness", "metallic"):
         off = (getattr(learned, name) - getattr(material, name)).abs()
         assert off.median() < 0.03, name
+
+
+def test_a_given_map_of_any_size_costs_as_many_rays_as_a_small_one(places: Places, monkeypatch):
+    """With a map of 512 × 1024 texels, the rays of all places took 20 GB."""
+    rays = []
+
+    def nothing(x: torch.Tensor, wi: torch.Tensor) -> SceneLight:
+        rays.append(wi[..., 0].numel())
+        return SceneLight(
+            torch.zeros_like(wi[..., 0], dtype=torch.bool),
+            torch.zeros_like(wi),
+            torch.full_like(wi[..., 0], math.inf),
+        )
+
+    monkeypatch.setattr(NeilfModel, "scene", property(lambda model: nothing))
+    few = places.where(torch.nonzero(places.place < 8)[:, 0])
+    model = trained_to(PAINT, places)
+    expected = light_up(model, few).parts
+    model.light.show(interpolate(sky().log_radiance, map_directions(512, 1024)).permute(2, 0, 1).exp())
+    rays.clear()
+    found = light_up(model, few).parts
+    assert sum(rays) <= 2 * 8 * 64 * 128
+    torch.testing.assert_close(found.mean(1), expected.mean(1), rtol=0.05, atol=1e-3)
