@@ -32,6 +32,7 @@ JUDGED = (
     "coloured-light",
     "reflection",
     "long-tails",
+    "rough-diffuse",
     "metals",
     "varying-roughness",
     "lobe-sampling",
@@ -45,8 +46,8 @@ TRUE_EFFECTS: Mapping[str, set[str]] = {
     "polished": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "tabletop_env": {"inter-reflection", "metals", *SKY, *GLOSSY},
     "tabletop_mix": {"inter-reflection", "lamps", "metals", *SKY, *GLOSSY},
-    "spot_city": {"inter-reflection", "long-tails", "metals", *SKY, *GLOSSY},
-    "spot_paint": {"inter-reflection", *SKY, *GLOSSY},
+    "spot_city": {"inter-reflection", "long-tails", "rough-diffuse", "metals", *SKY, *GLOSSY},
+    "spot_paint": {"inter-reflection", "long-tails", "rough-diffuse", *SKY, *GLOSSY},
 }
 """The effects that each capture has, by the name of its folder: those of `effect_scenes`, and four others."""
 

@@ -35,7 +35,7 @@ def masking(lobe: str, cos_i: Array, cos_o: Array, r: Array) -> Array:
 
 def brdf(lobe: str, b: Array, r: Array, m: Array, n: Array, wo: Array, wi: Array) -> tuple[Array, Array]:
     """f_d and f_s of METHOD §1 for vectors (..., 3) and scalars (..., 1); both zero below the horizon of
-    wi.
+    wi. f_d of "ggx_burley" is that of Disney's BRDF.
     """
     cos_i, cos_o = (wi * n).sum(-1, keepdims=True), (wo * n).sum(-1, keepdims=True)
     above = cos_i > 0
@@ -46,7 +46,19 @@ def brdf(lobe: str, b: Array, r: Array, m: Array, n: Array, wo: Array, wi: Array
     specular = (
         distribution(lobe, (h * n).sum(-1, keepdims=True), r) * fresnel * masking(lobe, cos_i, cos_o, r)
     )
-    return above * (1 - m) / np.pi * b, above * specular / (4 * cos_i * cos_o)
+    diffuse = (1 - m) / np.pi * b
+    if lobe == "ggx_burley":
+        diffuse = diffuse * burley(cos_i, cos_o, (wi * h).sum(-1, keepdims=True), r)
+    return above * diffuse, above * specular / (4 * cos_i * cos_o)
+
+
+def burley(cos_i: Array, cos_o: Array, cos_d: Array, r: Array) -> Array:
+    """Disney's diffuse lobe relative to Lambert's, as refraction and retro-reflection (Burley 2015,
+    "Extending the Disney BRDF to a BSDF", eq. 4).
+    """
+    grazing_i, grazing_o, retro = (1 - cos_i) ** 5, (1 - cos_o) ** 5, 2 * r * cos_d**2
+    refracted = (1 - grazing_i / 2) * (1 - grazing_o / 2)
+    return refracted + retro * (grazing_i + grazing_o + grazing_i * grazing_o * (retro - 1))
 
 
 # ------------------------------------------------------------------------------------------------- quadrature

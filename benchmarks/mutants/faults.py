@@ -30,8 +30,15 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "the part without Fresnel is not reduced by the Fresnel part",
         BRDF,
-        "SpecularTerms(reflected - grazing, grazing)",
-        "SpecularTerms(reflected, grazing)",
+        "BrdfTerms(diffuse, reflected - grazing, grazing)",
+        "BrdfTerms(diffuse, reflected, grazing)",
+        "shading/test_brdf.py",
+    ),
+    Mutant(
+        "Disney's diffuse lobe is brightest for smooth surfaces",
+        BRDF,
+        "2 * at_least_float32(roughness) * cos.d",
+        "2 * (1 - at_least_float32(roughness)) * cos.d",
         "shading/test_brdf.py",
     ),
     Mutant(

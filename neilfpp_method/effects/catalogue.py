@@ -22,7 +22,7 @@ class Effect:
         title: description for the report.
         is_on: function of the settings: whether they simulate the effect or leave it to evidence.
         on: the settings that switch it on.
-        off: the settings that switch it off.
+        off: function of the settings: those that switch it off.
         obstacle: function of the settings: the reason why the effect cannot be switched; empty if it can.
         cost: function of the settings: the additional computation while material is trained.
         risk: the error of the result if the effect is left out although the scene has it.
@@ -31,6 +31,8 @@ class Effect:
             that the effect is not needed.
         requires_gain: whether the effect is on only if its gain is significantly above the threshold. Other
             effects stay on unless their gain is significantly below it.
+        may_switch_on: whether evidence may switch the effect on although the settings leave it out. Evidence
+            on other effects only switches off what the settings simulate.
         needs: name of the effect that this one requires; empty if it requires none.
         solved: whether the light solver decides the effect at every fit, so that evidence changes no
             setting.
@@ -40,7 +42,7 @@ class Effect:
     title: str
     is_on: Callable[[NeilfConfig], bool]
     on: Callable[[NeilfConfig], Mapping[str, Any]]
-    off: Mapping[str, Any]
+    off: Callable[[NeilfConfig], Mapping[str, Any]]
     obstacle: Callable[[NeilfConfig], str]
     cost: Callable[[NeilfConfig], str]
     risk: str
@@ -48,12 +50,13 @@ class Effect:
     solved: bool = False
     advised: bool = False
     requires_gain: bool = False
+    may_switch_on: bool = False
     needs: str = ""
 
 
 def switched(config: NeilfConfig, effect: Effect, on: bool) -> NeilfConfig:
     """The same settings with one effect switched on or off."""
-    return changed(config, effect.on(config) if on else effect.off)
+    return changed(config, effect.on(config) if on else effect.off(config))
 
 
 def _none(config: NeilfConfig) -> str:
@@ -82,6 +85,10 @@ def _is_map(config: NeilfConfig) -> bool:
 
 def _without_reflection(what: str) -> Callable[[NeilfConfig], str]:
     return lambda config: "" if config.shading.specular else what
+
+
+def _has_long_tails(config: NeilfConfig) -> bool:
+    return config.shading.lobe != "spherical_gaussian"
 
 
 def _map_on(config: NeilfConfig) -> Mapping[str, Any]:
@@ -116,7 +123,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="shadows and inter-reflection",
             is_on=lambda config: config.light.inter_reflection != "off",
             on=_traced_on,
-            off={"light.inter_reflection": "off"},
+            off=lambda config: {"light.inter_reflection": "off"},
             obstacle=_none,
             cost=_traced_cost,
             risk="shadows and light between surfaces are baked into the base colour",
@@ -126,7 +133,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="near lamps",
             is_on=lambda config: isinstance(config.light, MapLightConfig) and config.light.kind != "distant",
             on=lambda config: {"light.kind": "distant_near"},
-            off={"light.kind": "distant"},
+            off=lambda config: {"light.kind": "distant"},
             obstacle=_free_light("a light that is free at every point includes that of lamps"),
             cost=lambda config: (
                 f"a second fit of the light every {_every(config)} steps, and a shadow ray per point and lamp"
@@ -139,7 +146,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="an environment map instead of even light",
             is_on=lambda config: _is_map(config) and config.light.environment_height > 1,
             on=_map_on,
-            off={"light.environment_height": 1},
+            off=lambda config: {"light.environment_height": 1},
             obstacle=lambda config: (
                 _free_light("a light that is free at every point is not a map")(config) or _given_map(config)
             ),
@@ -157,7 +164,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="a coloured map instead of grey light",
             is_on=lambda config: not config.light.monochrome,
             on=lambda config: {"light.monochrome": False},
-            off={"light.monochrome": True},
+            off=lambda config: {"light.monochrome": True},
             obstacle=_given_map,
             cost=lambda config: "three unknowns per texel instead of one",
             risk="the colours of the light are baked into the base colour",
@@ -169,7 +176,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="specular reflection",
             is_on=lambda config: config.shading.specular,
             on=lambda config: {"shading.specular": True},
-            off={"shading.specular": False},
+            off=lambda config: {"shading.specular": False},
             obstacle=_none,
             cost=lambda config: (
                 f"the specular lobe in {config.shading.train_samples * config.train.rays} directions a step, "
@@ -184,7 +191,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="metals",
             is_on=lambda config: config.brdf.metals,
             on=lambda config: {"brdf.metals": True},
-            off={"brdf.metals": False},
+            off=lambda config: {"brdf.metals": False},
             obstacle=_without_reflection("surfaces without specular reflection have no metallic"),
             cost=lambda config: "one more unknown at every point",
             risk="metal becomes a dark glossy dielectric",
@@ -197,7 +204,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="roughness that varies over the surface",
             is_on=lambda config: config.brdf.varying_roughness,
             on=lambda config: {"brdf.varying_roughness": True},
-            off={"brdf.varying_roughness": False},
+            off=lambda config: {"brdf.varying_roughness": False},
             obstacle=_without_reflection("surfaces without specular reflection have no roughness"),
             cost=lambda config: "one more unknown at every point",
             risk="all highlights have the average sharpness",
@@ -210,7 +217,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="importance sampling of the specular lobe",
             is_on=lambda config: config.shading.sampler in ("mis", "lobe"),
             on=lambda config: {"shading.sampler": "mis"},
-            off={"shading.sampler": "no_lobe"},
+            off=lambda config: {"shading.sampler": "no_lobe"},
             obstacle=_without_reflection("surfaces without specular reflection have no lobe"),
             cost=lambda config: (
                 f"the pdf of the lobe in {config.shading.train_samples * config.train.rays} directions a step"
@@ -222,9 +229,9 @@ EFFECTS: Mapping[str, Effect] = {
         Effect(
             name="long-tails",
             title="the long tails of highlights (GGX)",
-            is_on=lambda config: config.shading.lobe == "ggx",
-            on=lambda config: {"shading.lobe": "ggx"},
-            off={"shading.lobe": "spherical_gaussian"},
+            is_on=_has_long_tails,
+            on=lambda config: {} if _has_long_tails(config) else {"shading.lobe": "ggx"},
+            off=lambda config: {"shading.lobe": "spherical_gaussian"},
             obstacle=_without_reflection("surfaces without specular reflection have no highlights"),
             cost=lambda config: "none",
             risk="the wide tails of highlights are explained by more roughness",
@@ -232,11 +239,27 @@ EFFECTS: Mapping[str, Effect] = {
             needs="reflection",
         ),
         Effect(
+            name="rough-diffuse",
+            title="diffuse reflection that depends on the roughness (Disney)",
+            is_on=lambda config: config.shading.lobe == "ggx_burley",
+            on=lambda config: {"shading.lobe": "ggx_burley"},
+            off=lambda config: {"shading.lobe": "ggx"} if _has_long_tails(config) else {},
+            obstacle=_without_reflection("surfaces without specular reflection have no roughness"),
+            cost=lambda config: (
+                f"the diffuse lobe in {config.shading.train_samples * config.train.rays} directions a step"
+            ),
+            risk="at flat angles, smooth paint is too bright and rough paint too dark",
+            not_measured=_free_light(UNKNOWN_IN_FREE_LIGHT),
+            requires_gain=True,
+            may_switch_on=True,
+            needs="long-tails",
+        ),
+        Effect(
             name="background",
             title="an open background",
             is_on=lambda config: config.background.kind != "constant",
             on=lambda config: {"background.kind": "inverted_sphere"},
-            off={"background.kind": "constant"},
+            off=lambda config: {"background.kind": "constant"},
             obstacle=lambda config: (
                 "R represents the background on the scene sphere" if config.background.kind == "none" else ""
             ),
@@ -248,7 +271,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="exposure and white balance of each photograph",
             is_on=lambda config: config.optimizer.exposure > 0,
             on=lambda config: {"optimizer.exposure": config.optimizer.exposure or EXPOSURE_RATE},
-            off={"optimizer.exposure": 0.0},
+            off=lambda config: {"optimizer.exposure": 0.0},
             obstacle=_none,
             cost=lambda config: "three unknowns per photograph",
             risk="differences of exposure become gloss, fog and uneven light",
@@ -258,7 +281,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="errors of the camera poses",
             is_on=lambda config: config.train.pose_fits > 0,
             on=lambda config: {"train.pose_fits": config.train.pose_fits or POSE_FITS},
-            off={"train.pose_fits": 0},
+            off=lambda config: {"train.pose_fits": 0},
             obstacle=_pose_obstacle,
             cost=lambda config: f"{config.train.pose_fits} fits of all cameras while G is trained",
             risk="surfaces and colours are blurred",
@@ -269,7 +292,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="pixels that hold display values instead of radiance",
             is_on=lambda config: False,
             on=lambda config: {},
-            off={},
+            off=lambda config: {},
             obstacle=lambda config: "set by the image files or --response",
             cost=lambda config: "the sRGB curve on every pixel",
             risk="radiance, and with it all light, is wrong",
@@ -279,7 +302,7 @@ EFFECTS: Mapping[str, Effect] = {
             title="joint training of surface and material",
             is_on=lambda config: config.train.joint_steps > 0,
             on=lambda config: {},
-            off={"train.joint_steps": 0},
+            off=lambda config: {"train.joint_steps": 0},
             obstacle=_joint_obstacle,
             cost=lambda config: f"{config.train.joint_steps} steps that train all fields",
             risk="errors of the surface that only shading reveals remain",

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.plan import Decision, Plan
-from neilfpp_method.effects.review import LightReview, improve_material, record_lamps, review_metals
+from neilfpp_method.effects.review import (
+    LightReview,
+    improve_material,
+    record_lamps,
+    review_diffuse,
+    review_metals,
+)
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
@@ -70,12 +76,12 @@ def start_light(followers: Followers, review: LightReview, step: int) -> Evidenc
 
 
 def improve(followers: Followers, places: Places, with_search: bool, step: int) -> None:
-    """Correct the scale of a half-trained model, and review metals (`review.improve_material`).
+    """Correct the scale of a half-trained model, and review metals and the diffuse lobe (`review`).
 
     Args:
         followers: what follows; the light may change, and the BRDF field may be trained.
         places: places in the training views, with linear radiance.
-        with_search: whether to search for paint and to review metals; without, only the scale is corrected.
+        with_search: whether to search for paint, and to review effects; without, only the scale is corrected.
         step: number of steps trained so far.
     """
     improved = improve_material(followers.model, followers.light_solver, places, with_search)
@@ -84,4 +90,6 @@ def improve(followers: Followers, places: Places, with_search: bool, step: int) 
     for summary in improved.summaries:
         followers.say(summary)
     if with_search:
-        follow(followers, review_metals(followers.plan, followers.model, improved.lit, step))
+        plan, model = followers.plan, followers.model
+        follow(followers, review_metals(plan, model, improved.lit, step))
+        follow(followers, review_diffuse(plan, model, places, step))

@@ -79,8 +79,8 @@ def stored_decision(values: Mapping[str, Any], where: str) -> Decision:
 def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> NeilfConfig:
     """Apply the newest decision on each effect to settings.
 
-    A decision by `--effects` can switch an effect on or off. Evidence only switches effects off: an effect
-    that it keeps stays as it is in the settings.
+    A decision by `--effects` can switch an effect on or off. Evidence only switches effects off, except those
+    with `Effect.may_switch_on`: an effect that it keeps stays as it is in the settings.
     """
     newest = {decision.effect: decision for decision in decisions}
     for name, decision in newest.items():
@@ -88,7 +88,7 @@ def decided_settings(settings: NeilfConfig, decisions: Sequence[Decision]) -> Ne
             continue
         if not decision.on:
             settings = switched(settings, EFFECTS[name], on=False)
-        elif decision.by == "option":
+        elif decision.by == "option" or EFFECTS[name].may_switch_on:
             settings = switched(settings, EFFECTS[name], on=True)
     return settings
 
@@ -126,10 +126,10 @@ class Plan:
                 decide(name, request.base == "all", "option", f"--effects {request.base}")
             elif request.base == "as-set":
                 decide(name, is_on, "settings", f"{'on' if is_on else 'off'} in the settings")
-            elif not is_on:
+            elif not is_on and not effect.may_switch_on:
                 decide(name, False, "settings", "off in the settings")
             elif effect.not_measured(settings):
-                decide(name, True, "settings", effect.not_measured(settings))
+                decide(name, is_on, "settings", effect.not_measured(settings))
         plan._leave_out_dependent_effects()
         return plan
 

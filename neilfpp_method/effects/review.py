@@ -12,6 +12,7 @@ import torch
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.evidence.alternatives import Alternatives
+from neilfpp_method.effects.evidence.diffuse import diffuse_evidence
 from neilfpp_method.effects.evidence.disagreement import RenderedSurface, shading_disagreement
 from neilfpp_method.effects.evidence.exposure import Exposures
 from neilfpp_method.effects.evidence.lobes import lobe_evidence
@@ -47,6 +48,7 @@ __all__ = [
     "record_exposures",
     "record_facts",
     "record_lamps",
+    "review_diffuse",
     "review_light",
     "review_light_at",
     "review_material",
@@ -243,6 +245,28 @@ def review_metals(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> l
     if decision.on:
         model.use(plan.config)
         teach(model.brdf, find_metal(lit, model.brdf))
+    return [decision]
+
+
+@torch.no_grad()
+def review_diffuse(plan: Plan, model: NeilfModel, places: Places, step: int) -> list[Decision]:
+    """Decide whether diffuse reflection depends on the roughness, under the light of a half-trained model.
+
+    The model uses the settings of the plan afterwards.
+
+    Args:
+        plan: the plan to which the decision is added.
+        model: its light is an environment map; see `places.search.is_comparison_due`.
+        places: places in the training views, with linear radiance.
+        step: number of steps trained so far.
+
+    Returns:
+        The new decision; empty if it is on, was decided otherwise, or if highlights have no long tails.
+    """
+    if model.config.shading.lobe != "ggx" or not plan.is_open("rough-diffuse"):
+        return []
+    decision = plan.decide("rough-diffuse", diffuse_evidence(model, places), step)
+    model.use(plan.config)
     return [decision]
 
 

@@ -44,6 +44,7 @@ def sent_by_patch(
         reflected = kd / math.pi
         if specular:
             cos = cosines(normal, direction, incident.wi)
+            reflected = reflected * _diffuse(model, cos, material.roughness)[..., None]
             schlick = _schlick(cos)[..., None]
             fresnel = f0 * (1 - schlick) + schlick
             reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * fresnel
@@ -59,17 +60,25 @@ def radiance_parts(
 
     The specular parts are zero if the model's shading is Lambertian.
     """
-    diffuse = incident.light.sum(1) / math.pi
-    nodes = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, len(diffuse), 1)
-    facing = diffuse.new_zeros(len(diffuse), wo.shape[1], len(nodes), 3)
-    grazing = torch.zeros_like(facing)
+    points, views, nodes = len(wo), wo.shape[1], len(ROUGHNESS_NODES)
+    diffuse = (incident.light.sum(1) / math.pi)[:, None, None].repeat(1, views, nodes, 1)
+    facing, grazing = torch.zeros_like(diffuse), torch.zeros_like(diffuse)
+    roughnesses = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, points, 1)
     for v, direction in enumerate(wo.unbind(1) if model.config.shading.specular else ()):
         cos = cosines(normal, direction, incident.wi)
         schlick = _schlick(cos)[..., None]
         light = torch.cat((incident.light * (1 - schlick), incident.light * schlick), -1)
-        lobes = torch.stack([_lobe(model, cos, roughness) for roughness in nodes], 1)
+        lobes = torch.stack([_lobe(model, cos, roughness) for roughness in roughnesses], 1)
         facing[:, v], grazing[:, v] = (lobes @ light).split(3, -1)
+        if model.lobe.diffuse is not None:
+            scattered = torch.stack([model.lobe.diffuse(cos, roughness) for roughness in roughnesses], 1)
+            diffuse[:, v] = scattered @ incident.light / math.pi
     return RadianceParts(diffuse, facing, grazing)
+
+
+def _diffuse(model: NeilfModel, cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """The diffuse lobe relative to Lambert's."""
+    return torch.ones_like(cos.i) if model.lobe.diffuse is None else model.lobe.diffuse(cos, roughness)
 
 
 def _lobe(model: NeilfModel, cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:

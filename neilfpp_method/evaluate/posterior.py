@@ -2,9 +2,9 @@
 
 For a given roughness r and metallic m, the outgoing radiance is linear in the base colour b:
 
-    L = b [(1 − m) D + m F(r)] + 0.04 (1 − m) F(r) + G(r)
+    L = b [(1 − m) D(r) + m F(r)] + 0.04 (1 − m) F(r) + G(r)
 
-D is the diffuse part. F and G are the specular lobe times 1 − (1 − cos)⁵ and (1 − cos)⁵, the two parts of
+D is the diffuse part, F and G are the specular lobe times 1 − (1 − cos)⁵ and (1 − cos)⁵, the two parts of
 Schlick's Fresnel term. The posterior is summed over a grid of roughness and metallic. In each cell of the
 grid, the base colour has a normal distribution per channel, truncated to [0, 1], in closed form. No
 linearisation is needed, and a posterior with two modes (metal or not) is represented as such.
@@ -25,7 +25,7 @@ from neilfpp_method.structures import Indexable, Material
 __all__ = ["ROUGHNESS_NODES", "Deviation", "Observations", "RadianceParts", "expected_error", "prior_error"]
 
 ROUGHNESS_NODES = (0.05, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8, 1.0)
-"""Values of roughness at which F and G are computed; both are interpolated linearly between them."""
+"""Values of roughness at which D, F and G are computed; they are interpolated linearly between them."""
 ROUGHNESS_CELLS, METALLIC_CELLS = 20, 9
 """Size of the grid over which the posterior is summed."""
 PRIOR_PRECISION = 1e-2
@@ -46,12 +46,12 @@ class RadianceParts(Indexable):
     """Parts of the radiance that N points send to V viewers.
 
     Attributes:
-        diffuse: D, the same for all viewers.
+        diffuse: D at each of the R `ROUGHNESS_NODES`; Lambert's is the same for all viewers and roughnesses.
         facing: F at each of the R `ROUGHNESS_NODES`.
         grazing: G at each of the R `ROUGHNESS_NODES`.
     """
 
-    diffuse: Float[Tensor, "N 3"]
+    diffuse: Float[Tensor, "N V R 3"]
     facing: Float[Tensor, "N V R 3"]
     grazing: Float[Tensor, "N V R 3"]
 
@@ -138,7 +138,7 @@ class _Products:
     Q is the number of roughness values; the last axis is broadcast over metallic.
     """
 
-    dd: Float[Tensor, "N 3 1 1"]
+    dd: Float[Tensor, "N 3 Q 1"]
     df: Float[Tensor, "N 3 Q 1"]
     ff: Float[Tensor, "N 3 Q 1"]
     dr: Float[Tensor, "N 3 Q 1"]
@@ -157,12 +157,11 @@ class _Products:
         covariance = shared @ shared.mT + torch.eye(shared.shape[2], device=shared.device, dtype=shared.dtype)
         factor = torch.linalg.cholesky(covariance)
         count = len(ROUGHNESS_NODES)
-        diffuse = parts.diffuse[:, None, None].expand(-1, scale.shape[1], 1, 3)
         radiance = observations.radiance[:, :, None]
-        stacked = torch.cat((parts.facing, parts.grazing, diffuse, radiance), 2) * scale[:, :, None]
+        stacked = torch.cat((parts.diffuse, parts.facing, parts.grazing, radiance), 2) * scale[:, :, None]
         white = torch.linalg.solve_triangular(factor, stacked.permute(0, 3, 1, 2), upper=False)
-        facing, grazing, d, radiance = white.split((count, count, 1, 1), -1)
-        f, r = facing @ interpolation, radiance - grazing @ interpolation
+        diffuse, facing, grazing, radiance = white.split((count, count, count, 1), -1)
+        d, f, r = diffuse @ interpolation, facing @ interpolation, radiance - grazing @ interpolation
         return cls(*((a * b).sum(2)[..., None] for a, b in ((d, d), (d, f), (f, f), (d, r), (f, r), (r, r))))
 
 

@@ -1,14 +1,16 @@
 """Light transport at several roughnesses at once, for pixels that share surface points.
 
 Rays are traced once per surface point, regardless of how many pixels show it and how many roughnesses are
-tried. The result has one layer for each part of the BRDF (see `transport`): layer 0 is the diffuse part, and
-layers 1 + 2k and 2 + 2k are the facing and grazing parts at roughness number k.
+tried. The result has one layer for each part of the BRDF (see `transport`): first the diffuse part, one layer
+for each roughness if it depends on the roughness and else a single one, and then the facing and grazing parts
+at each roughness. `layers_of` has their indices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,11 +21,22 @@ from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.lamp_transport import in_sight, lamp_kernel
 from neilfpp_method.lighting.map_transport import TexelRays, trace_texels
-from neilfpp_method.lighting.transport import Transport, brdf_kernel, spans
-from neilfpp_method.shading.brdf import Lobe
+from neilfpp_method.lighting.transport import Transport, kernel_of, spans
+from neilfpp_method.shading.brdf import Lobe, cosines
 from neilfpp_method.structures import Observed, SceneTracer
 
-__all__ = ["LightLayers", "SharedPoints", "lamp_layers", "layers_at", "light_layers", "texel_layers"]
+__all__ = [
+    "LightLayers",
+    "SharedPoints",
+    "diffuse_layers",
+    "lamp_layers",
+    "layers_at",
+    "layers_of",
+    "light_layers",
+    "texel_layers",
+]
+
+Number = TypeVar("Number", int, Tensor)
 
 
 @dataclass(frozen=True)
@@ -129,26 +142,54 @@ def lamp_layers(
         roughnesses: the values of roughness.
         lobe: the specular lobe.
     """
-    layers = []
-    for number, value in enumerate(roughnesses):
+    kernels = []
+    for value in roughnesses:
         roughness = torch.full_like(observed.position[:, :1], value)
         kernel = lamp_kernel(lamps.lit_places, lamps.radius, sight, observed, roughness, lobe)
-        layers.append((kernel if number == 0 else kernel[1:]) @ lamps.lit_intensity)
-    return torch.cat(layers)
+        kernels.append(kernel @ lamps.lit_intensity)
+    return _in_layers(kernels, lobe)
 
 
-def layers_at(layers: Tensor, number: Int[Tensor, " N"]) -> Tensor:
+def diffuse_layers(layers: int, roughnesses: int) -> int:
+    """Number of diffuse layers, which come first, among all layers of this number of roughnesses."""
+    return layers - 2 * roughnesses
+
+
+def layers_of(number: Number, layers: int, roughnesses: int) -> tuple[Number, Number, Number]:
+    """Indices of the layers of the diffuse, facing and grazing part at a roughness.
+
+    Args:
+        number: index of the roughness.
+        layers: number of all layers.
+        roughnesses: number of roughnesses.
+
+    Example:
+        >>> layers_of(2, layers=7, roughnesses=3), layers_of(2, layers=9, roughnesses=3)
+        ((0, 5, 6), (2, 7, 8))
+    """
+    diffuse = diffuse_layers(layers, roughnesses)
+    return number * int(diffuse > 1), diffuse + 2 * number, diffuse + 2 * number + 1
+
+
+def layers_at(layers: Tensor, number: Int[Tensor, " N"], roughnesses: int) -> Tensor:
     """The diffuse, facing and grazing parts of each pixel at its own roughness.
 
     Args:
         layers: (K, N, C) all layers.
         number: index of the roughness of each pixel.
+        roughnesses: number of roughnesses.
 
     Returns:
         (3, N, C) the three parts.
     """
     rows = torch.arange(len(number), device=number.device)
-    return layers[torch.stack((torch.zeros_like(number), 1 + 2 * number, 2 + 2 * number)), rows]
+    return layers[torch.stack(layers_of(number, len(layers), roughnesses)), rows]
+
+
+def _in_layers(kernels: Sequence[Tensor], lobe: Lobe) -> Tensor:
+    """All layers, from the three parts (3, N, C) at each roughness."""
+    diffuse = kernels[:1] if lobe.diffuse is None else kernels
+    return torch.cat([kernel[:1] for kernel in diffuse] + [kernel[1:] for kernel in kernels])
 
 
 def _kernels(
@@ -169,9 +210,10 @@ def _kernels(
     for span in spans(len(shared.observed), texels):
         observed = shared.observed[span]
         drawn = rays[shared.point[span]].redrawn(environment, observed.position)
-        weight, layers = drawn.weight(observed.normal), []
-        for number, value in enumerate(roughnesses):
-            roughness = torch.full_like(observed.position[:, :1], value)
-            kernel = brdf_kernel(observed, roughness, drawn.wi, weight, lobe)
-            layers.append(kernel if number == 0 else kernel[1:])
-        yield drawn, torch.cat(layers)
+        weight = drawn.weight(observed.normal)
+        cos = cosines(observed.normal, observed.wo, drawn.wi)
+        kernels = [
+            kernel_of(cos, torch.full_like(observed.position[:, :1], value), weight, lobe)
+            for value in roughnesses
+        ]
+        yield drawn, _in_layers(kernels, lobe)

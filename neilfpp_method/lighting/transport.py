@@ -24,10 +24,17 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.kernels.products import times_channels
-from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
+from neilfpp_method.shading.brdf import (
+    Cosines,
+    Lobe,
+    brdf_terms,
+    cosines,
+    diffuse_reflectance,
+    normal_reflectance,
+)
 from neilfpp_method.structures import Material, Observed
 
-__all__ = ["Transport", "brdf_kernel", "outgoing_radiance", "spans"]
+__all__ = ["Transport", "brdf_kernel", "kernel_of", "outgoing_radiance", "spans"]
 
 PAIRS_AT_ONCE = 2**18
 """Maximum number of pairs of a point and a direction that are traced at once; it bounds memory."""
@@ -103,8 +110,15 @@ def brdf_kernel(
     """The parts of the BRDF times `weight`, which contains the cosine and the solid angle."""
     if lobe is None:
         return weight[None] / math.pi
-    terms = specular_terms(roughness, observed.normal, observed.wo, wi, lobe)
-    return torch.stack((weight / math.pi, weight * terms.facing, weight * terms.grazing))
+    return kernel_of(cosines(observed.normal, observed.wo, wi), roughness, weight, lobe)
+
+
+def kernel_of(
+    cos: Cosines, roughness: Float[Tensor, "N 1"], weight: Float[Tensor, "N S"], lobe: Lobe
+) -> Float[Tensor, "3 N S"]:
+    """`brdf_kernel` of known cosines, which several roughnesses share."""
+    terms = brdf_terms(cos, roughness, lobe)
+    return torch.stack((weight * terms.diffuse / math.pi, weight * terms.facing, weight * terms.grazing))
 
 
 def spans(points: int, sources: int) -> list[slice]:

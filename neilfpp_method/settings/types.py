@@ -268,8 +268,10 @@ HostConfig = Annotated[VolSdfConfig | MeshConfig, tyro.conf.AvoidSubcommands]
 class ShadingConfig:
     """The rendering equation (METHOD §1)."""
 
-    lobe: Literal["spherical_gaussian", "ggx"] = "spherical_gaussian"
-    """Microfacet distribution and masking function of the specular lobe."""
+    lobe: Literal["spherical_gaussian", "ggx", "ggx_burley"] = "spherical_gaussian"
+    """Microfacet distribution and masking function of the specular lobe. ggx_burley: GGX, and in place of
+    Lambert's diffuse lobe that of Disney (Burley 2012), which depends on the roughness.
+    """
     specular: bool = True
     """Whether surfaces reflect specularly. If False, they are Lambertian, without roughness and metallic."""
     sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"

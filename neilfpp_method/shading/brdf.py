@@ -1,6 +1,6 @@
-"""The simplified Disney BRDF, f = f_d + f_s (METHOD §1), with two microfacet lobes.
+"""The simplified Disney BRDF, f = f_d + f_s (METHOD §1), with two microfacet lobes and two diffuse ones.
 
-    f_d = (1 − m)/π · b
+    f_d = (1 − m)/π · b · d(wo, wi, r),  d = 1 for Lambert's lobe
     f_s = D(n·h) · F(wo·h) · V(n·wi, n·wo),  V = G / (4 (n·wi)(n·wo))
 
 V is always computed in the form in which the cosines have cancelled, without 0/0 at grazing angles. All
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -23,18 +23,19 @@ from neilfpp_method.structures import Material
 __all__ = [
     "DIELECTRIC_F0",
     "GGX",
+    "GGX_BURLEY",
     "LOBES",
     "SPHERICAL_GAUSSIAN",
+    "BrdfTerms",
     "BrdfValue",
     "Cosines",
     "Lobe",
-    "SpecularTerms",
+    "brdf_terms",
     "cosines",
     "diffuse_reflectance",
     "evaluate",
     "normal_reflectance",
     "roughness_floor",
-    "specular_terms",
 ]
 
 DIELECTRIC_F0 = 0.04
@@ -46,9 +47,9 @@ DIELECTRIC_F0 = 0.04
 
 @dataclass(frozen=True)
 class Lobe:
-    """A microfacet lobe: functions of cosines (N, S) and roughness (N, 1), each (N, S).
+    """A microfacet lobe and the diffuse lobe beside it, as functions of cosines and roughness (N, 1).
 
-    Roughness below `roughness_floor` counts as that floor, without a gradient.
+    All values are (N, S). Roughness below `roughness_floor` counts as that floor, without a gradient.
     """
 
     distribution: Callable[[Tensor, Tensor], Tensor]
@@ -59,6 +60,8 @@ class Lobe:
     """n·h for uniform numbers in [0, 1), such that h, at a uniform azimuth, has the density `pdf_h`."""
     pdf_h: Callable[[Tensor, Tensor], Tensor]
     """Density of h per steradian of the hemisphere about n, for n·h ≥ 0."""
+    diffuse: Callable[[Cosines, Tensor], Tensor] | None = None
+    """d, the diffuse lobe relative to Lambert's, from all cosines and r; None: Lambert's own, d = 1."""
 
 
 def roughness_floor(dtype: torch.dtype) -> float:
@@ -139,9 +142,27 @@ def _ggx_sample_cos_h(u: Float[Tensor, "N S"], roughness: Float[Tensor, "N 1"]) 
     return ((1 - u) / (1 - u + _alpha(roughness).square() * u)).sqrt()
 
 
+def _burley_diffuse(cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
+    """d of Disney's BRDF (Burley 2012, "Physically-based shading at Disney", §5.3), for cosines ≥ 0.
+
+        d = (1 + f (1 − n·wi)⁵)(1 + f (1 − n·wo)⁵),  f = 2 r (wo·h)² − ½
+
+    At grazing angles a smooth surface is darker than Lambert's, because it reflects more of the light before
+    it can scatter, and a rough one is brighter.
+    """
+    change = 2 * at_least_float32(roughness) * cos.d.square() - 0.5
+    towards, away = (1 + change * (1 - cosine.clamp(0, 1)).pow(5) for cosine in (cos.i, cos.o))
+    return towards * away
+
+
 SPHERICAL_GAUSSIAN = Lobe(_sg_distribution, _sg_visibility, _sg_sample_cos_h, _sg_pdf_h)
 GGX = Lobe(_ggx_distribution, _ggx_visibility, _ggx_sample_cos_h, _ggx_pdf_h)
-LOBES: Mapping[str, Lobe] = {"spherical_gaussian": SPHERICAL_GAUSSIAN, "ggx": GGX}
+GGX_BURLEY = replace(GGX, diffuse=_burley_diffuse)
+LOBES: Mapping[str, Lobe] = {
+    "spherical_gaussian": SPHERICAL_GAUSSIAN,
+    "ggx": GGX,
+    "ggx_burley": GGX_BURLEY,
+}
 
 
 # --------------------------------------------------------------------------------------------------- geometry
@@ -180,15 +201,16 @@ class BrdfValue:
 
 
 @dataclass(frozen=True)
-class SpecularTerms:
-    """f_s = F0 · `facing` + `grazing`: a scalar pair per direction, without the surface's colour F0."""
+class BrdfTerms:
+    """f = k_d/π · `diffuse` + F0 · `facing` + `grazing`: scalars per direction, without colours."""
 
+    diffuse: Float[Tensor, "N S"]
     facing: Float[Tensor, "N S"]
     grazing: Float[Tensor, "N S"]
 
 
 def diffuse_reflectance(material: Material, specular: bool = True) -> Float[Tensor, "N 3"]:
-    """π f_d: (1 − m) b, or b for a surface without a specular part."""
+    """k_d = (1 − m) b, or b for a surface without a specular part."""
     base_color = at_least_float32(material.base_color)
     return base_color * (1 - material.metallic) if specular else base_color
 
@@ -199,26 +221,20 @@ def normal_reflectance(material: Material) -> Float[Tensor, "N 3"]:
     return DIELECTRIC_F0 * (1 - metallic) + base_color * metallic
 
 
-def specular_terms(
-    roughness: Float[Tensor, "N 1"],
-    n: Float[Tensor, "N 3"],
-    wo: Float[Tensor, "N 3"],
-    wi: Float[Tensor, "#N S 3"],
-    lobe: Lobe,
-) -> SpecularTerms:
-    """The scalars of the specular lobe; zero for wi at or below the horizon.
+def brdf_terms(cos: Cosines, roughness: Float[Tensor, "N 1"], lobe: Lobe) -> BrdfTerms:
+    """The scalars of both lobes; those of the specular one are zero for wi at or below the horizon.
 
     With s = (1 − wo·h)⁵, Schlick's F0 + (1 − F0) s is F0 (1 − s) + s. (The power is on the whole bracket; the
     supplement of the paper misprints it.) A viewer below the horizon, which blended normals can bring about,
     counts as one at the horizon.
     """
-    cos = cosines(n, wo, wi)
     reflected = lobe.distribution(cos.h, roughness) * lobe.visibility(
         cos.i.clamp_min(0), cos.o.clamp_min(0), roughness
     )
     reflected = torch.where(cos.i > 0, reflected, 0.0)
     grazing = reflected * (1 - cos.d).pow(5)
-    return SpecularTerms(reflected - grazing, grazing)
+    diffuse = torch.ones_like(cos.i) if lobe.diffuse is None else lobe.diffuse(cos, roughness)
+    return BrdfTerms(diffuse, reflected - grazing, grazing)
 
 
 def evaluate(
@@ -238,6 +254,7 @@ def evaluate(
     diffuse = (diffuse_reflectance(material, specular) / math.pi).unsqueeze(1) * above
     if not specular:
         return BrdfValue(diffuse, torch.zeros_like(diffuse))
-    terms = specular_terms(material.roughness, n, wo, wi, lobe)
+    terms = brdf_terms(cosines(n, wo, wi), material.roughness, lobe)
     facing, grazing = terms.facing.unsqueeze(-1), terms.grazing.unsqueeze(-1)
+    diffuse = diffuse * terms.diffuse.unsqueeze(-1)
     return BrdfValue(diffuse, normal_reflectance(material).unsqueeze(1) * facing + grazing)

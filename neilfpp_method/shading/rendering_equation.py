@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.shading.brdf import Lobe, diffuse_reflectance, normal_reflectance, specular_terms
+from neilfpp_method.shading.brdf import Lobe, brdf_terms, cosines, diffuse_reflectance, normal_reflectance
 from neilfpp_method.shading.frame import at_least_float32, dot
 from neilfpp_method.structures import Incident, Material, Shading
 
@@ -36,15 +36,16 @@ def shade(
     radiance = at_least_float32(incident.radiance)
     weight = dot(incident.wi, n).clamp_min(0) * incident.weight
 
-    diffuse = diffuse_reflectance(material, lobe is not None) / math.pi * _integrate(weight, radiance)
+    reflectance = diffuse_reflectance(material, lobe is not None) / math.pi
     if lobe is None:
+        diffuse = reflectance * _integrate(weight, radiance)
         return Shading(diffuse, diffuse, torch.zeros_like(diffuse))
 
-    terms = specular_terms(material.roughness, n, wo, incident.wi, lobe)
-    facing, grazing = (
-        _integrate(weight * terms.facing, radiance),
-        _integrate(weight * terms.grazing, radiance),
+    terms = brdf_terms(cosines(n, wo, incident.wi), material.roughness, lobe)
+    scattered, facing, grazing = (
+        _integrate(weight * term, radiance) for term in (terms.diffuse, terms.facing, terms.grazing)
     )
+    diffuse = reflectance * scattered
     reflected = normal_reflectance(material) * facing + grazing
     return Shading(diffuse + reflected, diffuse, reflected)
 

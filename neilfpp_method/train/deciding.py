@@ -75,7 +75,7 @@ def is_improvement_due(subject: Subject, position: StagePosition) -> bool:
 
 
 def improve_half_trained(subject: Subject, position: StagePosition, step: int) -> None:
-    """Correct the scale of light and material, and review metals (`effects.review`).
+    """Correct the scale of light and material, and review metals and the diffuse lobe (`effects.review`).
 
     This may change the light and train the BRDF field.
 
@@ -85,7 +85,8 @@ def improve_half_trained(subject: Subject, position: StagePosition, step: int) -
         step: number of steps trained so far in all stages.
     """
     model, solver = subject.model, subject.light_solver
-    if not (model.brdf.metals or subject.plan.is_open("metals") or solver.scale_is_free):
+    is_reviewed = any(subject.plan.is_open(name) for name in ("metals", "rough-diffuse"))
+    if not (model.brdf.metals or is_reviewed or solver.scale_is_free):
         return
     seed_stream(subject.seed, Stream.SEARCH, step)
     places = light_places(model, subject.pixels, subject.max_pixels)

@@ -32,7 +32,7 @@ def material(base_color: float = 0.5, roughness: float = 0.5, metallic: float = 
 def lambertian(views: int, diffuse: float = 1.0) -> RadianceParts:
     """Uniform light, so that D is `diffuse`, without a specular part."""
     nothing = torch.zeros(1, views, R, 3)
-    return RadianceParts(torch.full((1, 3), diffuse), nothing, nothing)
+    return RadianceParts(torch.full_like(nothing, diffuse), nothing, nothing)
 
 
 def sights(radiance: torch.Tensor, noise: float, shared: torch.Tensor | None = None) -> Observations:
@@ -88,7 +88,7 @@ def test_a_view_without_the_shared_error_determines_the_base_color():
 @pytest.mark.parametrize("estimate", [(0.5, 0.5, 0.5), (0.9, 0.1, 0.0)])
 def test_a_point_without_views_has_the_error_under_the_prior(estimate):
     seen = replace(sights(torch.full((3,), 0.4), 0.01), visible=torch.zeros(1, 3, dtype=torch.bool))
-    looks = RadianceParts(torch.ones(1, 3), torch.rand(1, 3, R, 3), torch.rand(1, 3, R, 3))
+    looks = RadianceParts(torch.ones(1, 3, R, 3), torch.rand(1, 3, R, 3), torch.rand(1, 3, R, 3))
     base_color, roughness, metallic = numbers(expected_error(looks, seen, material(*estimate)))
     assert base_color == pytest.approx(math.sqrt(1 / 12 + (estimate[0] - 0.5) ** 2), rel=1e-2)
     assert roughness == pytest.approx(math.sqrt(1 / 12 + (estimate[1] - 0.5) ** 2), rel=1e-2)
@@ -117,7 +117,9 @@ def random_point(views: int = 5) -> tuple[RadianceParts, Observations]:
     torch.manual_seed(3)
     falling = torch.linspace(2.0, 0.1, R)[:, None] * (0.3 + torch.rand(1, views, 1, 1))
     looks = RadianceParts(
-        0.6 + 0.2 * torch.rand(1, 3), falling * torch.ones(3), 0.2 * falling.square() * torch.ones(3)
+        0.6 + 0.2 * torch.rand(1, views, R, 1) * torch.ones(3),
+        falling * torch.ones(3),
+        0.2 * falling.square() * torch.ones(3),
     )
     shared = 0.05 * torch.rand(1, views, 3, 2)
     return looks, Observations(
@@ -138,15 +140,16 @@ def test_agrees_with_an_exhaustive_search():
     m = torch.linspace(0, 1, 9)
     prior = torch.linspace(0, 1, 10).sqrt().asin().diff()
     b = (torch.arange(400) + 0.5) / 400
-    f, g = (torch.zeros(len(r), 5) for _ in range(2))
+    d, f, g = (torch.zeros(len(r), 5) for _ in range(3))
     density, second = torch.ones(len(r), len(m)), torch.zeros(len(r), len(m))
     for c in range(3):
         for v in range(5):
-            for out, part in ((f, looks.facing), (g, looks.grazing)):
+            for out, part in ((d, looks.diffuse), (f, looks.facing), (g, looks.grazing)):
                 out[:, v] = torch.from_numpy(__import__("numpy").interp(r, nodes, part[0, v, :, c]))
         covariance = torch.diag(seen.noise[0, :, c] ** 2) + seen.shared[0, :, c] @ seen.shared[0, :, c].T
-        F, G, B, M = f[:, None, None], g[:, None, None], b[None, None, :, None], m[None, :, None, None]
-        sent = (1 - M) * B * looks.diffuse[0, c] + (0.04 * (1 - M) + B * M) * F + G
+        D, F, G = (part[:, None, None] for part in (d, f, g))
+        B, M = b[None, None, :, None], m[None, :, None, None]
+        sent = (1 - M) * B * D + (0.04 * (1 - M) + B * M) * F + G
         off = (sent - seen.radiance[0, :, c]).double()
         likelihood = torch.exp(-0.5 * (off @ covariance.double().inverse() * off).sum(-1))
         density = density * likelihood.mean(-1)
@@ -164,7 +167,7 @@ def test_agrees_with_an_exhaustive_search():
 def test_a_mirror_that_may_be_bright_paint_is_uncertain():
     """If the specular part equals the diffuse part in all views, the images do not distinguish them."""
     views = 8
-    same = RadianceParts(torch.ones(1, 3), torch.ones(1, views, R, 3), torch.zeros(1, views, R, 3))
+    same = RadianceParts(torch.ones(1, views, R, 3), torch.ones(1, views, R, 3), torch.zeros(1, views, R, 3))
     highlight = torch.linspace(0.2, 4.0, views)[None, :, None, None].expand(1, views, R, 3)
     telling = replace(same, facing=highlight)
     alike = numbers(expected_error(same, sights(torch.full((views,), 0.5), 0.01), material(0.5, 0.5, 0.0)))
@@ -181,7 +184,9 @@ def test_roughness_is_determined_by_views_across_the_lobe():
     angle = torch.linspace(0, 1.2, views)[:, None]
     lobe = torch.exp(-angle.square() / (0.05 + nodes.square())) / (0.05 + nodes.square())
     looks = RadianceParts(
-        torch.zeros(1, 3), lobe[None, ..., None].expand(1, views, R, 3), torch.zeros(1, views, R, 3)
+        torch.zeros(1, views, R, 3),
+        lobe[None, ..., None].expand(1, views, R, 3),
+        torch.zeros(1, views, R, 3),
     )
     metal = material(0.8, 0.5, 1.0)
     flat = replace(looks, facing=torch.ones_like(looks.facing))

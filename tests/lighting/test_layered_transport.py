@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -10,11 +11,12 @@ from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.lamp_transport import from_lamps
 from neilfpp_method.lighting.layered_transport import SharedPoints, layers_at, light_layers, texel_layers
 from neilfpp_method.lighting.map_transport import from_texels
-from neilfpp_method.shading.brdf import GGX
+from neilfpp_method.shading.brdf import GGX, GGX_BURLEY
 from tests.lighting.surfaces import half_room, points
 
 ROUGHNESSES = (0.3, 0.7)
 PIXELS = 40
+lobes = pytest.mark.parametrize("lobe", [GGX, GGX_BURLEY], ids=["one diffuse layer", "one per roughness"])
 
 
 def shared_points() -> SharedPoints:
@@ -23,36 +25,38 @@ def shared_points() -> SharedPoints:
     return SharedPoints(observed.position, observed.normal, observed, torch.arange(PIXELS))
 
 
-def test_the_layers_of_a_map_agree_with_each_roughness_alone():
+@lobes
+def test_the_layers_of_a_map_agree_with_each_roughness_alone(lobe):
     environment, shared = EnvironmentLight(48, 1.0), shared_points()
     torch.manual_seed(3)
-    draws = [texel_layers(environment, shared, ROUGHNESSES, GGX, None) for _ in range(16)]
+    draws = [texel_layers(environment, shared, ROUGHNESSES, lobe, None) for _ in range(16)]
     layers = torch.stack([drawn.sources.float() for drawn in draws]).mean(0)
     for number, value in enumerate(ROUGHNESSES):
         roughness = torch.full((PIXELS, 1), value)
         alone = torch.stack(
-            [from_texels(environment, shared.observed, roughness, GGX, None).sources for _ in range(16)]
+            [from_texels(environment, shared.observed, roughness, lobe, None).sources for _ in range(16)]
         ).mean(0)
-        found = layers_at(layers, torch.full((PIXELS,), number))
+        found = layers_at(layers, torch.full((PIXELS,), number), len(ROUGHNESSES))
         # Summed over the texels: single ones are noisy.
         torch.testing.assert_close(found.sum(-1), alone.sum(-1), rtol=0.05, atol=5e-3)
 
 
-def test_the_layers_of_a_light_agree_with_each_roughness_alone():
+@lobes
+def test_the_layers_of_a_light_agree_with_each_roughness_alone(lobe):
     """Radiance is interpolated between the texels of the map, which differ by a factor of up to ten."""
     environment, lamps, shared = EnvironmentLight(24, 1.0), Lamps(2, 0.06), shared_points()
     torch.manual_seed(0)
     environment.show(torch.rand(3, 24, 48) + 0.1)
     lamps.place(torch.tensor([[0.0, 0.0, 2.0]]), torch.full((1, 3), 5.0))
     light = LightModel(environment, lamps)
-    draws = [light_layers(light, shared, ROUGHNESSES, GGX, half_room) for _ in range(64)]
+    draws = [light_layers(light, shared, ROUGHNESSES, lobe, half_room) for _ in range(64)]
     found = torch.stack([drawn.light + drawn.scene for drawn in draws]).mean(0)
     radiance = environment.log_radiance.exp().flatten(1).t()
     for number, value in enumerate(ROUGHNESSES):
         roughness = torch.full((PIXELS, 1), value)
-        alone = [from_texels(environment, shared.observed, roughness, GGX, half_room) for _ in range(16)]
-        lit = from_lamps(lamps.lit_places, lamps.radius, shared.observed, roughness, GGX, half_room).sources
+        alone = [from_texels(environment, shared.observed, roughness, lobe, half_room) for _ in range(16)]
+        lit = from_lamps(lamps.lit_places, lamps.radius, shared.observed, roughness, lobe, half_room).sources
         expected = sum(one.sources @ radiance + one.scene for one in alone) / len(alone)
         expected = expected + lit @ lamps.lit_intensity
-        layers = layers_at(found, torch.full((PIXELS,), number))
+        layers = layers_at(found, torch.full((PIXELS,), number), len(ROUGHNESSES))
         torch.testing.assert_close(layers, expected, rtol=0.02, atol=0.01)

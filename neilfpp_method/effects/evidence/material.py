@@ -34,6 +34,7 @@ from neilfpp_method.effects.places.fit import (
 )
 from neilfpp_method.effects.places.gathering import Split, gather_places
 from neilfpp_method.effects.places.grid import ROUGHNESSES
+from neilfpp_method.lighting.layered_transport import diffuse_layers, layers_of
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading import LOBES
@@ -159,11 +160,13 @@ class Variant:
     def _restrict(self, transport: Transport) -> Transport:
         if not self.reflects:
             keep = torch.zeros(len(transport.sources), 1, 1, device=transport.scene.device)
-            keep[0] = 1
+            keep[: diffuse_layers(len(keep), len(ROUGHNESSES))] = 1
             return Transport(transport.sources * keep.half(), transport.scene * keep)
         if self.roughness is None:
             return transport
-        layers = [0] + [1 + 2 * self.roughness, 2 + 2 * self.roughness] * len(ROUGHNESSES)
+        count = len(ROUGHNESSES)
+        diffuse, *reflected = layers_of(self.roughness, len(transport.sources), count)
+        layers = [diffuse] * diffuse_layers(len(transport.sources), count) + reflected * count
         return Transport(transport.sources[layers], transport.scene[layers])
 
 

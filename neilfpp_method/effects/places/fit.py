@@ -21,6 +21,7 @@ from neilfpp_method.effects.places.data import ROWS, PlaceData
 from neilfpp_method.effects.places.grid import (
     METALLICS,
     MIN_BASE_COLOR,
+    ROUGHNESSES,
     best_materials,
     neighbors,
     on_grid,
@@ -165,7 +166,9 @@ def mean_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " P"]:
 
 def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
     """The diffuse, facing and grazing parts of each pixel at the roughness of its place."""
-    return Transport(layers_at(transport.sources, number).float(), layers_at(transport.scene, number))
+    count = len(ROUGHNESSES)
+    sources = layers_at(transport.sources, number, count).float()
+    return Transport(sources, layers_at(transport.scene, number, count))
 
 
 def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: int) -> PlaceFit:

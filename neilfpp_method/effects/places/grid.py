@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.lighting.layered_transport import layers_of
 from neilfpp_method.lighting.objective import ERROR_FLOOR, OUTLIER_ERROR
 from neilfpp_method.shading.brdf import DIELECTRIC_F0
 from neilfpp_method.structures import Material
@@ -111,12 +112,12 @@ def best_materials(
         metallics: indices in `METALLICS` of the values that are tried.
         near: indices of the neighbours of each place, including itself (`neighbors`).
     """
-    diffuse, unit = parts[0], places.observed.pixel + ERROR_FLOOR * typical
+    unit = places.observed.pixel + ERROR_FLOOR * typical
     first = torch.zeros(places.count, dtype=torch.long, device=unit.device)
     base_color = torch.full((places.count, 3), MIN_BASE_COLOR, device=unit.device)
     best = BestMaterials(base_color, first, first, torch.full_like(base_color[:, 0], torch.inf))
     for k in range(len(ROUGHNESSES)):
-        facing, grazing = parts[1 + 2 * k], parts[2 + 2 * k]
+        diffuse, facing, grazing = (parts[i] for i in layers_of(k, len(parts), len(ROUGHNESSES)))
         for j in metallics:
             m = METALLICS[j]
             # The relative error of a pixel is base_color · slope − target.

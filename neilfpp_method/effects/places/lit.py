@@ -23,6 +23,7 @@ from neilfpp_method.lighting.layered_transport import LightLayers, layers_at, li
 from neilfpp_method.lighting.objective import DARK_FLOOR
 from neilfpp_method.lighting.transport import outgoing_radiance
 from neilfpp_method.model import NeilfModel
+from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material
 
 __all__ = ["METAL", "PAINT", "LitPlaces", "light_up"]
@@ -88,7 +89,7 @@ class LitPlaces:
         """Relative error of each pixel if the places have this material, with roughness of the grid."""
         grid = torch.tensor(ROUGHNESSES, device=self.near.device).log()
         number = (material.roughness.clamp_min(MIN_ROUGHNESS).log() - grid).abs().argmin(1)
-        parts = layers_at(self.parts, number[self.places.place])
+        parts = layers_at(self.parts, number[self.places.place], len(grid))
         outgoing = outgoing_radiance(parts, material[self.places.place])
         return relative_error(outgoing, self.places, self.typical)
 
@@ -102,18 +103,21 @@ class LitPlaces:
 
 
 @torch.no_grad()
-def light_up(model: NeilfModel, places: Places) -> LitPlaces:
+def light_up(model: NeilfModel, places: Places, lobe: Lobe | None = None) -> LitPlaces:
     """Trace the light of a model, which has an environment map, to the pixels of places.
 
     Args:
         model: gives the light, the scene, the lobe, and the base colours by which neighbours are chosen.
         places: places with their pixels in the training views, in linear radiance. Those without pixels are
             left out of the result.
+        lobe: the lobe of their surfaces; None: that of the model.
     """
     places = places.only_shown()
     shared = places.shared_points()
     light = LightModel(model.light.at_most(MAX_ROWS), model.lamps)
-    draws = [light_layers(light, shared, ROUGHNESSES, model.lobe, model.scene) for _ in range(DIRECTIONS)]
+    draws = [
+        light_layers(light, shared, ROUGHNESSES, lobe or model.lobe, model.scene) for _ in range(DIRECTIONS)
+    ]
     layers = LightLayers(
         torch.stack([drawn.light for drawn in draws]).mean(0),
         torch.stack([drawn.scene for drawn in draws]).mean(0),
