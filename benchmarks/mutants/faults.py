@@ -15,8 +15,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "diffuse part without 1/π",
         "shading/rendering_equation.py",
-        " / math.pi * _integrate(",
-        " * _integrate(",
+        "lobe is not None) / math.pi",
+        "lobe is not None)",
         "shading/test_rendering_equation.py",
     ),
     Mutant(
