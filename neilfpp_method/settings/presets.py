@@ -147,7 +147,6 @@ FAST: Mapping[str, Any] = {
     "host.loss.point_cloud": 0.1,
     "host.loss.patches": 0.5,
     "host.loss.mask": 1.0,
-    "loss.smoothness": 0.0,
     "loss.lambertian": 0.0,
     "loss.position_gradient": 0.0,
     "loss.normal_gradient": 0.0,
