@@ -130,6 +130,10 @@ class Plan:
                 decide(name, False, "settings", "off in the settings")
             elif effect.not_measured(settings):
                 decide(name, is_on, "settings", effect.not_measured(settings))
+            elif effect.may_switch_on and is_on:
+                decide(name, True, "settings", "on in the settings")
+            elif effect.may_switch_on:
+                decide(name, False, "evidence", "off until a half-trained model shows a gain")
         plan._leave_out_dependent_effects()
         return plan
 

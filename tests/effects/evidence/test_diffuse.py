@@ -64,3 +64,10 @@ def test_what_is_on_or_decided_stays(effects, lobe):
     before = model.config.shading.lobe
     assert review_diffuse(plan, model, places, 1000) == []
     assert model.config.shading.lobe == before
+
+
+def test_until_it_is_measured_it_is_off():
+    plan = Plan.begin(parse_effects("auto"), preset("fast"))
+    assert plan.newest("rough-diffuse").reason == "off until a half-trained model shows a gain"
+    assert plan.is_open("rough-diffuse")
+    assert plan.config.shading.lobe == "ggx"
