@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Float64, Int
 from torch import Tensor
 
 from neilfpp_method.data.cameras.projection import CameraRays
@@ -141,10 +141,10 @@ class PixelDataset:
         """Return all pixels of `views[i]`, row by row, also invalid ones. Image gradients as in `sample`."""
         indices, camera = self.store.indices(i), self.views[i].camera
         numbers, colors = np.arange(indices.start, indices.stop), self.store.view_colors(i)
-        shape = camera.height, camera.width
-        gradient = (
-            image_gradient(self._display_luminance(colors).view(shape)).reshape(-1) if gradients else None
-        )
+        gradient = None
+        if gradients:
+            luminances = self._display_luminance(colors).view(camera.height, camera.width)
+            gradient = image_gradient(luminances).float().reshape(-1)
         return self._batch(numbers, np.full(len(numbers), i), colors, gradient)
 
     def at(self, i: int, pixel: Int[Tensor, " N"]) -> PixelBatch:
@@ -194,9 +194,13 @@ class PixelDataset:
         positive = self._positive_luminance() if self.capture.hdr else ()
         return MIDDLE_GRAY / float(positive.median()) if len(positive) else 1.0
 
-    def _display_luminance(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float32[Tensor, "*shape"]:
-        """Display luminance; linear images are exposed so that the median of the object is middle grey."""
-        color = torch.from_numpy(colors)
+    def _display_luminance(self, colors: Float32[np.ndarray, "*shape 3"]) -> Float64[Tensor, "*shape"]:
+        """Display luminance; linear images are exposed so that the median of the object is middle grey.
+
+        In float64: the last bit of a float32 result depends on how many pixels are computed at once, and
+        then the gradient of a pixel drawn alone would differ from its gradient in a whole view.
+        """
+        color = torch.from_numpy(colors).double()
         return luminance(tone_map(self._exposure * color) if self.capture.hdr else color)
 
     def _gradients_at(
@@ -210,7 +214,7 @@ class PixelDataset:
         rows = np.clip(row + NEIGHBORS[:, 0, None], 0, last[:, 1])
         around = self.store.starts[views] + rows * size[:, 0] + columns
         colors = self.store.colors(around, np.broadcast_to(views, around.shape))
-        return scharr(self._display_luminance(colors).unbind(0))
+        return scharr(self._display_luminance(colors).unbind(0)).float()
 
     # --------------------------------------------------------------------------------------------- statistics
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float
 from torch import Tensor
 
 __all__ = ["NEIGHBORS", "image_gradient", "scharr"]
@@ -15,7 +15,7 @@ NEIGHBORS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0, 
 """Offsets (row, column) of the 3 × 3 neighbourhood of a pixel."""
 
 
-def image_gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
+def image_gradient(values: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     """Return the gradient (`scharr`) of a whole image, with replicated borders."""
     padded = torch.nn.functional.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     height, width = values.shape
@@ -24,7 +24,7 @@ def image_gradient(values: Float32[Tensor, "H W"]) -> Float32[Tensor, "H W"]:
     )
 
 
-def scharr(about: Sequence[Float32[Tensor, "*shape"]]) -> Float32[Tensor, "*shape"]:
+def scharr(about: Sequence[Float[Tensor, "*shape"]]) -> Float[Tensor, "*shape"]:
     """Return the length of the Scharr gradient at pixels, from the values at their `NEIGHBORS`.
 
     The usual factor of 1/32 is left out, so a ramp of 0.01 per pixel has the value 0.32. The weight of L_smth

@@ -111,6 +111,17 @@ def test_single_pixels_are_those_of_their_views(tmp_path: Path) -> None:
     assert edges.any(), "gradients at the border are compared, too"
 
 
+def test_the_image_gradient_of_a_pixel_does_not_depend_on_how_many_are_drawn(tmp_path: Path) -> None:
+    capture = load_capture(make_capture(tmp_path / "c"))
+    pixels, _ = opened(capture, tmp_path / "pixels")
+    whole = torch.cat([pixels.view(i).image_gradient for i in range(6)])
+    for count in range(1, 40):
+        torch.manual_seed(count)
+        numbers = pixels.draw(count)
+        torch.manual_seed(count)
+        assert torch.equal(pixels.sample(count).image_gradient, whole[numbers]), count
+
+
 # ------------------------------------------------------------------------------------- found again, made anew
 
 
