@@ -11,7 +11,7 @@ from torch import Tensor
 from neilfpp_method.evaluate.patches import PatchLight, by_patch, patch_count
 from neilfpp_method.evaluate.posterior import ROUGHNESS_NODES, RadianceParts
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.shading.brdf import Cosines, cosines, diffuse_reflectance, normal_reflectance
+from neilfpp_method.shading.brdf import brdf_terms, cosines, evaluate
 from neilfpp_method.structures import Material
 
 __all__ = ["radiance_parts", "sent_by_patch"]
@@ -38,17 +38,11 @@ def sent_by_patch(
         Linear radiance; the sum over the last axis is the outgoing radiance.
     """
     specular, patches = model.config.shading.specular, patch_count(model)
-    kd, f0 = diffuse_reflectance(material, specular)[:, None], normal_reflectance(material)[:, None]
     sent = []
     for direction in wo.unbind(1):
-        reflected = kd / math.pi
-        if specular:
-            cos = cosines(normal, direction, incident.wi)
-            reflected = reflected * _diffuse(model, cos, material.roughness)[..., None]
-            schlick = _schlick(cos)[..., None]
-            fresnel = f0 * (1 - schlick) + schlick
-            reflected = reflected + _lobe(model, cos, material.roughness)[..., None] * fresnel
-        sent.append(by_patch(incident.light * reflected, incident.patch, patches))
+        brdf = evaluate(material, normal, direction, incident.wi, model.lobe, specular)
+        reflected = incident.light * (brdf.diffuse + brdf.specular)
+        sent.append(by_patch(reflected, incident.patch, patches))
     return torch.stack(sent, 1)
 
 
@@ -63,30 +57,12 @@ def radiance_parts(
     points, views, nodes = len(wo), wo.shape[1], len(ROUGHNESS_NODES)
     diffuse = (incident.light.sum(1) / math.pi)[:, None, None].repeat(1, views, nodes, 1)
     facing, grazing = torch.zeros_like(diffuse), torch.zeros_like(diffuse)
-    roughnesses = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, points, 1)
-    for v, direction in enumerate(wo.unbind(1) if model.config.shading.specular else ()):
-        cos = cosines(normal, direction, incident.wi)
-        schlick = _schlick(cos)[..., None]
-        light = torch.cat((incident.light * (1 - schlick), incident.light * schlick), -1)
-        lobes = torch.stack([_lobe(model, cos, roughness) for roughness in roughnesses], 1)
-        facing[:, v], grazing[:, v] = (lobes @ light).split(3, -1)
-        if model.lobe.diffuse is not None:
-            scattered = torch.stack([model.lobe.diffuse(cos, roughness) for roughness in roughnesses], 1)
-            diffuse[:, v] = scattered @ incident.light / math.pi
+    if model.config.shading.specular:
+        roughnesses = diffuse.new_tensor(ROUGHNESS_NODES)[:, None, None].expand(-1, points, 1)
+        for v, direction in enumerate(wo.unbind(1)):
+            cos = cosines(normal, direction, incident.wi)
+            terms = [brdf_terms(cos, roughness, model.lobe) for roughness in roughnesses]
+            diffuse[:, v] = torch.stack([term.diffuse for term in terms], 1) @ incident.light / math.pi
+            facing[:, v] = torch.stack([term.facing for term in terms], 1) @ incident.light
+            grazing[:, v] = torch.stack([term.grazing for term in terms], 1) @ incident.light
     return RadianceParts(diffuse, facing, grazing)
-
-
-def _diffuse(model: NeilfModel, cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
-    """The diffuse lobe relative to Lambert's."""
-    return torch.ones_like(cos.i) if model.lobe.diffuse is None else model.lobe.diffuse(cos, roughness)
-
-
-def _lobe(model: NeilfModel, cos: Cosines, roughness: Float[Tensor, "N 1"]) -> Float[Tensor, "N S"]:
-    """Microfacet distribution times visibility term, D V."""
-    distribution = model.lobe.distribution(cos.h, roughness)
-    return distribution * model.lobe.visibility(cos.i.clamp_min(0), cos.o.clamp_min(0), roughness)
-
-
-def _schlick(cos: Cosines) -> Float[Tensor, "N S"]:
-    """(1 − ωo·h)⁵ of Schlick's Fresnel term."""
-    return (1 - cos.d).pow(5)
