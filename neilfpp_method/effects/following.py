@@ -92,4 +92,4 @@ def improve(followers: Followers, places: Places, with_search: bool, step: int) 
     if with_search:
         plan, model = followers.plan, followers.model
         follow(followers, review_metals(plan, model, improved.lit, step))
-        follow(followers, review_diffuse(plan, model, places, step))
+        follow(followers, review_diffuse(plan, model, improved.lit, step))

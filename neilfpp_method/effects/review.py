@@ -249,7 +249,7 @@ def review_metals(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> l
 
 
 @torch.no_grad()
-def review_diffuse(plan: Plan, model: NeilfModel, places: Places, step: int) -> list[Decision]:
+def review_diffuse(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> list[Decision]:
     """Decide whether diffuse reflection depends on the roughness, under the light of a half-trained model.
 
     The model uses the settings of the plan afterwards.
@@ -257,7 +257,7 @@ def review_diffuse(plan: Plan, model: NeilfModel, places: Places, step: int) -> 
     Args:
         plan: the plan to which the decision is added.
         model: its light is an environment map; see `places.search.is_comparison_due`.
-        places: places in the training views, with linear radiance.
+        lit: places under this light, with the lobe of the model.
         step: number of steps trained so far.
 
     Returns:
@@ -265,7 +265,7 @@ def review_diffuse(plan: Plan, model: NeilfModel, places: Places, step: int) -> 
     """
     if model.config.shading.lobe != "ggx" or not plan.is_open("rough-diffuse"):
         return []
-    decision = plan.decide("rough-diffuse", diffuse_evidence(model, places), step)
+    decision = plan.decide("rough-diffuse", diffuse_evidence(model, lit), step)
     model.use(plan.config)
     return [decision]
 

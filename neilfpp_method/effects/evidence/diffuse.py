@@ -12,11 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.measurement import Measurement, mean_reduction
-from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.grid import METALLICS
-from neilfpp_method.effects.places.lit import PAINT, LitPlaces, light_up
+from neilfpp_method.effects.places.lit import PAINT, LitPlaces, with_lobe
 from neilfpp_method.model import NeilfModel
-from neilfpp_method.shading.brdf import GGX, GGX_BURLEY, Lobe
+from neilfpp_method.shading.brdf import GGX_BURLEY
 
 __all__ = ["diffuse_evidence"]
 
@@ -31,24 +30,15 @@ THRESHOLD = 0.0005
 
 
 @torch.no_grad()
-def diffuse_evidence(model: NeilfModel, places: Places) -> Measurement:
+def diffuse_evidence(model: NeilfModel, lit: LitPlaces) -> Measurement:
     """Mean reduction of the relative error of the places by Disney's diffuse lobe, in held-back views.
 
-    The random directions are the same for both lobes: their noise is as large as the reduction.
-
     Args:
-        model: its light is an environment map.
-        places: places in the training views, with linear radiance.
+        model: its light is an environment map, its lobe GGX with Lambert's diffuse lobe.
+        lit: places under this light with this lobe.
     """
-    seed = int(torch.randint(2**31, ()))
-
-    def lit(lobe: Lobe) -> LitPlaces:
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            return light_up(model, places, lobe)
-
-    lambert, disney, metals = lit(GGX), lit(GGX_BURLEY), model.brdf.metals
-    reductions = (_errors(lambert, fold, metals) - _errors(disney, fold, metals) for fold in range(FOLDS))
+    disney, metals = with_lobe(model, lit, GGX_BURLEY), model.brdf.metals
+    reductions = (_errors(lit, fold, metals) - _errors(disney, fold, metals) for fold in range(FOLDS))
     what = "reduction of the error in held-back views by Disney's diffuse lobe, under the trained light"
     return mean_reduction(reductions, what, THRESHOLD)
 

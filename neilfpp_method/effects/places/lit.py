@@ -26,7 +26,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material
 
-__all__ = ["METAL", "PAINT", "LitPlaces", "light_up"]
+__all__ = ["METAL", "PAINT", "LitPlaces", "light_up", "with_lobe"]
 
 PAINT, METAL = range(1), range(1, len(METALLICS))
 """Indices in `METALLICS` of paint and of metal."""
@@ -55,12 +55,14 @@ class LitPlaces:
         layers: the layers of L_o of each pixel that this light and the scene cause.
         near: indices of the neighbours of each place, including itself.
         typical: radiance of a typical pixel.
+        seed: seed of the random directions from which the layers were computed.
     """
 
     places: Places
     layers: LightLayers
     near: Int[Tensor, "P M"]
     typical: float
+    seed: int
 
     @property
     def parts(self) -> Float[Tensor, "K N 3"]:
@@ -74,7 +76,7 @@ class LitPlaces:
     def where(self, rows: Int[Tensor, " R"]) -> LitPlaces:
         """The same places with only some of the pixels."""
         layers = LightLayers(self.layers.light[:, rows], self.layers.scene[:, rows])
-        return LitPlaces(self.places.where(rows), layers, self.near, self.typical)
+        return replace(self, places=self.places.where(rows), layers=layers)
 
     def hold_back(self, fold: int, folds: int) -> Split[LitPlaces]:
         """Hold back one fold of the views, which are numbered from 0 to `folds` − 1."""
@@ -103,25 +105,38 @@ class LitPlaces:
 
 
 @torch.no_grad()
-def light_up(model: NeilfModel, places: Places, lobe: Lobe | None = None) -> LitPlaces:
+def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     """Trace the light of a model, which has an environment map, to the pixels of places.
 
     Args:
         model: gives the light, the scene, the lobe, and the base colours by which neighbours are chosen.
         places: places with their pixels in the training views, in linear radiance. Those without pixels are
             left out of the result.
-        lobe: the lobe of their surfaces; None: that of the model.
     """
-    places = places.only_shown()
-    shared = places.shared_points()
-    light = LightModel(model.light.at_most(MAX_ROWS), model.lamps)
-    draws = [
-        light_layers(light, shared, ROUGHNESSES, lobe or model.lobe, model.scene) for _ in range(DIRECTIONS)
-    ]
-    layers = LightLayers(
+    places, seed = places.only_shown(), int(torch.randint(2**31, ()))
+    position = places.shared_points().position
+    look = COLOR_SCALE * model.brdf(position).base_color.clamp_min(DARK_FLOOR).log()
+    near = neighbors(torch.cat((position, look), -1), NEIGHBORS_SHARE)
+    layers = _mean_layers(model, places, model.lobe, seed)
+    return LitPlaces(places, layers, near, model.facts.median_radiance, seed)
+
+
+@torch.no_grad()
+def with_lobe(model: NeilfModel, lit: LitPlaces, lobe: Lobe) -> LitPlaces:
+    """The same places with another lobe, under the light that the model has now.
+
+    The random directions are the same, so their noise cancels when two lobes are compared.
+    """
+    return replace(lit, layers=_mean_layers(model, lit.places, lobe, lit.seed))
+
+
+def _mean_layers(model: NeilfModel, places: Places, lobe: Lobe, seed: int) -> LightLayers:
+    """Mean of the layers over `DIRECTIONS` draws of random directions."""
+    light, shared = LightModel(model.light.at_most(MAX_ROWS), model.lamps), places.shared_points()
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        draws = [light_layers(light, shared, ROUGHNESSES, lobe, model.scene) for _ in range(DIRECTIONS)]
+    return LightLayers(
         torch.stack([drawn.light for drawn in draws]).mean(0),
         torch.stack([drawn.scene for drawn in draws]).mean(0),
     )
-    look = COLOR_SCALE * model.brdf(shared.position).base_color.clamp_min(DARK_FLOOR).log()
-    near = neighbors(torch.cat((shared.position, look), -1), NEIGHBORS_SHARE)
-    return LitPlaces(places, layers, near, model.facts.median_radiance)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.effects.review import review_diffuse
@@ -40,7 +41,7 @@ def half_trained(places: Places, effects: str = "auto", lobe: str = "ggx") -> tu
 def test_the_lobe_of_the_images_is_recognised(lobe):
     places = smooth_paint(lobe)
     plan, model = half_trained(places)
-    (decision,) = review_diffuse(plan, model, places, 1000)
+    (decision,) = review_diffuse(plan, model, light_up(model, places), 1000)
     assert decision.on == (lobe == "ggx_burley")
     assert abs(decision.evidence.value) > 2 * decision.evidence.deviation
     assert plan.config.shading.lobe == model.config.shading.lobe == lobe
@@ -62,7 +63,8 @@ def test_what_is_on_or_decided_stays(effects, lobe):
     places = smooth_paint("ggx_burley")
     plan, model = half_trained(places, effects, lobe)
     before = model.config.shading.lobe
-    assert review_diffuse(plan, model, places, 1000) == []
+    lit = light_up(half_trained(places)[1], places)
+    assert review_diffuse(plan, model, lit, 1000) == []
     assert model.config.shading.lobe == before
 
 
