@@ -32,6 +32,10 @@ TINY_DEPTH = 1e-12
 """Optical depths are raised to at least this value, so that the gradient of their logarithm is finite. A ray
 that misses the surface by 28 β has it.
 """
+TINY_GRADIENT = 1e-6
+"""Lengths of gradients are at least this, so that the gradient of the length is finite."""
+FLAT = 0.01
+"""Change per scene unit below which roughness and metallic count as constant; the object has radius 1."""
 
 
 def photometric(
@@ -85,7 +89,7 @@ def exposure(drift: Float[Tensor, "V 3"]) -> LossTerm:
 
 def eikonal(gradient: Float[Tensor, "P 3"]) -> LossTerm:
     """L_Eik = |‖∇G‖ − 1|. Its gradient is finite where ∇G = 0."""
-    return LossTerm((_safe_norm(gradient) - 1.0).abs())
+    return LossTerm((_norm(gradient, TINY_GRADIENT) - 1.0).abs())
 
 
 def hessian(matrix: Float[Tensor, "P 3 3"]) -> LossTerm:
@@ -130,10 +134,13 @@ def smoothness(
     metallic_gradient: Float[Tensor, "N 3"],
     image_gradient: Float[Tensor, " N"],
 ) -> LossTerm:
-    """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic are smooth where the image is smooth."""
-    return LossTerm(
-        (_safe_norm(roughness_gradient) + _safe_norm(metallic_gradient)) * torch.exp(-image_gradient)
-    )
+    """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic are smooth where the image is smooth.
+
+    Gradients shorter than `FLAT` have no effect. The norm has a kink at 0, and in an almost constant field
+    rounding would decide in which direction the loss changes it.
+    """
+    slopes = _norm(roughness_gradient, FLAT) + _norm(metallic_gradient, FLAT)
+    return LossTerm(slopes * torch.exp(-image_gradient))
 
 
 def lambertian(material: Material) -> LossTerm:
@@ -150,6 +157,6 @@ def scale_gradient(value: Tensor, scale: float) -> Tensor:
     return value * scale + value.detach() * (1.0 - scale)
 
 
-def _safe_norm(vector: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    # The floor keeps the derivative of the square root finite at 0; it changes lengths below 1e-6 only.
-    return vector.square().sum(-1).clamp_min(1e-12).sqrt()
+def _norm(vector: Float[Tensor, "P 3"], shortest: float) -> Float[Tensor, " P"]:
+    """Lengths, at least `shortest`; below it the gradient is 0, and at 0 it is finite."""
+    return vector.square().sum(-1).clamp_min(shortest**2).sqrt()

@@ -48,6 +48,15 @@ def test_smoothness_is_weaker_where_the_image_changes():
     assert term.values.item() == pytest.approx((5.0 + 10.0) * math.exp(-1.0))
 
 
+def test_smoothness_does_not_move_an_almost_constant_field():
+    """Near 0 the direction of a gradient is rounding noise, and the norm would make a full step of it."""
+    steep, flat = torch.tensor([[0.0, 0.02, 0.0]]), torch.tensor([[0.0, 0.005, 0.0]])
+    for gradient, pull in ((steep, 1.0), (flat, 0.0)):
+        gradient.requires_grad_(True)
+        losses.smoothness(gradient, torch.zeros(1, 3), torch.zeros(1)).values.sum().backward()
+        assert gradient.grad.norm().item() == pytest.approx(pull)
+
+
 def test_lambertian_is_zero_for_a_rough_dielectric_only():
     one, zero = torch.ones(1, 1), torch.zeros(1, 1)
     assert losses.lambertian(Material(torch.ones(1, 3), one, zero)).values.item() == 0.0

@@ -289,7 +289,8 @@ def test_r_material_and_light_are_trained_and_the_mesh_is_not():
     assert set(model.parameter_groups()) == {"radiance", "brdf", "light"}
     terms = model.losses(sphere_batch(), Stage.MATERIAL_INIT)
     weights = active_losses(Stage.MATERIAL_INIT, model.config, model.stages)
-    assert set(weights) == {"volume", "physical", "inter_reflection", "lambertian", "exposure"}
+    expected = {"volume", "physical", "inter_reflection", "smoothness", "lambertian", "exposure"}
+    assert set(weights) == expected
     weigh(terms, weights).loss.backward()
     for name, group in model.parameter_groups().items():
         assert any(p.grad is not None and p.grad.abs().max() > 0 for p in group), name
