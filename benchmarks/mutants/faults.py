@@ -201,14 +201,14 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "L_Eik asks for gradients of length 0",
         "losses.py",
-        "(_safe_norm(gradient) - 1.0).abs()",
-        "_safe_norm(gradient).abs()",
+        "(_norm(gradient, TINY_GRADIENT) - 1.0).abs()",
+        "_norm(gradient, TINY_GRADIENT).abs()",
         "test_losses.py",
     ),
     Mutant(
         "the gradient of a length is not finite at 0",
         "losses.py",
-        ".clamp_min(1e-12).sqrt()",
+        ".clamp_min(shortest**2).sqrt()",
         ".sqrt()",
         "test_losses.py",
     ),
