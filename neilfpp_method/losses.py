@@ -35,7 +35,7 @@ that misses the surface by 28 β has it.
 TINY_GRADIENT = 1e-6
 """Lengths of gradients are at least this, so that the gradient of the length is finite."""
 MIN_SLOPE = 0.01
-"""Gradient of roughness or metallic, per scene unit, below which L_smth has no effect. The object has radius 1."""
+"""Gradient of roughness or metallic, per scene unit, below which L_smth has no effect."""
 
 
 def photometric(
@@ -136,8 +136,8 @@ def smoothness(
 ) -> LossTerm:
     """L_smth = (‖∇r‖ + ‖∇m‖) exp(−‖∇I‖): roughness and metallic are smooth where the image is smooth.
 
-    Gradients shorter than `MIN_SLOPE` have no effect. The norm has a kink at 0, and in an almost constant field
-    rounding would decide in which direction the loss changes it.
+    Gradients shorter than `MIN_SLOPE` have no effect. The norm has a kink at 0, and in an almost constant
+    field rounding would decide in which direction the loss changes it.
     """
     slopes = _norm(roughness_gradient, MIN_SLOPE) + _norm(metallic_gradient, MIN_SLOPE)
     return LossTerm(slopes * torch.exp(-image_gradient))
