@@ -24,6 +24,7 @@ __all__ = [
     "scale_gradient",
     "smoothness",
     "surface",
+    "tilt",
 ]
 
 MISS_DISTANCE = 0.02
@@ -146,6 +147,11 @@ def smoothness(
 def lambertian(material: Material) -> LossTerm:
     """L_Lam = |r − 1| + |m|: without evidence to the contrary a surface is rough and not metallic."""
     return LossTerm((material.roughness - 1.0).abs() + material.metallic.abs())
+
+
+def tilt(vector: Float[Tensor, "N 3"]) -> LossTerm:
+    """Prior on the tilts of normals: the squared angle (radians) by which they correct the geometry."""
+    return LossTerm(vector.square().sum(-1))
 
 
 def scale_gradient(value: Tensor, scale: float) -> Tensor:

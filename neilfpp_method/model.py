@@ -17,10 +17,12 @@ from neilfpp_method import losses
 from neilfpp_method.fields import (
     BrdfField,
     LightModel,
+    NormalTilts,
     PhotographGains,
     PoseCorrections,
     at_mean_exposure,
     make_light,
+    tilted,
 )
 from neilfpp_method.hosts.base import HasParameterGroups, HasStages, Host, Regularized, SmoothsNormals
 from neilfpp_method.hosts.outputs import OutputCheck
@@ -71,6 +73,7 @@ class NeilfModel(nn.Module):
     Attributes:
         host: geometry G and outgoing radiance R.
         brdf: B, the material at every point.
+        tilts: corrections of the normals for shading; None if surfaces are shaded with those of the host.
         light, lamps: L, the light that arrives at unoccluded points, and the small lamps near the scene.
         gains: gain of each photograph relative to the mean; None if all are assumed to have one exposure.
         poses: corrections of the training cameras; None if their poses are as given. The model gets rays of
@@ -99,6 +102,7 @@ class NeilfModel(nn.Module):
         self.check_outputs = OutputCheck(host, config.shading.hit_share, may_be_constant=borrowed)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         self.brdf = BrdfField(config.brdf, config.encoding, config.background.radius)
+        self.tilts = NormalTilts() if config.shading.normals == "refined" else None
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         self.poses: PoseCorrections | None = None
@@ -221,11 +225,12 @@ class NeilfModel(nn.Module):
 
     @timed("shading")
     def _surface_pixels(self, hits: SurfaceHits, pixels: PixelBatch) -> SurfacePixels:
-        """Surface points to shade; the gradients of position and normal are scaled by the settings."""
-        settings, normal = self.config.loss, self.shading_normals(hits.position, hits.normal)
+        """Surface points to shade; gradients to the host's position and normal are scaled by the settings."""
+        settings = self.config.loss
+        hit_normal = losses.scale_gradient(hits.normal, settings.normal_gradient)
         return SurfacePixels(
             position=losses.scale_gradient(hits.position, settings.position_gradient),
-            normal=losses.scale_gradient(normal, settings.normal_gradient),
+            normal=self.shading_normals(hits.position, hit_normal),
             wo=-pixels.directions,
             pixel=pixels.color,
             image_gradient=pixels.image_gradient,
@@ -235,7 +240,7 @@ class NeilfModel(nn.Module):
     def _material_and_priors(
         self, surface: SurfacePixels, active: Mapping[str, float]
     ) -> tuple[Material, dict[str, LossTerm]]:
-        """The material of surface points, and its active priors L_smth and L_Lam."""
+        """The material of surface points, and the active priors on it and on the tilts of normals."""
         priors = {}
         if "smoothness" in active:
             with timed("regularizers"):
@@ -248,6 +253,8 @@ class NeilfModel(nn.Module):
             material = self.brdf(surface.position)
         if "lambertian" in active:
             priors["lambertian"] = losses.lambertian(material)
+        if "tilt" in active:
+            priors["tilt"] = losses.tilt(self.tilts(surface.position))
         return material, priors
 
     @timed("shading")
@@ -306,11 +313,13 @@ class NeilfModel(nn.Module):
     def shading_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Unit normals for shading: smoothed by the host if it can, with the gradient of `normal`."""
-        if not isinstance(self.host, SmoothsNormals):
+        """Unit normals for shading, refined if the settings say so, with the gradient of `normal`."""
+        if self.tilts is None:
             return normal
-        smooth = self.host.smooth_normals(position.detach(), normal.detach())
-        return smooth + (normal - normal.detach())
+        refined = normal.detach()
+        if isinstance(self.host, SmoothsNormals):
+            refined = self.host.smooth_normals(position.detach(), refined)
+        return tilted(refined, self.tilts(position)) + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance at x from wi: of the light, the lamps, or a surface that occludes them."""
@@ -366,10 +375,12 @@ class NeilfModel(nn.Module):
         """Parameters by field: the model's own and, unless borrowed, those that the host offers."""
         trains_host = isinstance(self.host, HasParameterGroups) and not self.borrowed
         host = self.host.parameter_groups() if trains_host else {}
-        own = {"brdf": self.brdf, "light": self.light}
+        own = {"brdf": list(self.brdf.parameters()), "light": list(self.light.parameters())}
+        if self.tilts is not None:
+            own["brdf"] += self.tilts.parameters()
         if self.gains is not None:
-            own["exposure"] = self.gains
-        return {**host, **{name: list(field.parameters()) for name, field in own.items()}}
+            own["exposure"] = list(self.gains.parameters())
+        return {**host, **own}
 
     def freeze_for(self, stage: Stage) -> None:
         """Set `requires_grad` of exactly the fields that a stage trains, and clear all gradients."""

@@ -23,8 +23,9 @@ from neilfpp_method.data.files.atomic_file import replacing
 from neilfpp_method.data.files.number_arrays import arrays_of_archive
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.extract import extract_mesh
-from neilfpp_method.hosts.base import HasSdf, SmoothsNormals
+from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.volsdf import HIT_RADIUS, VolSdfHost
+from neilfpp_method.model import NeilfModel
 from neilfpp_method.train.run import Run
 
 __all__ = [
@@ -37,7 +38,7 @@ __all__ = [
     "write_surface",
 ]
 
-FORMAT = 1
+FORMAT = 2
 """Version of the file."""
 NORMALS_AT_ONCE = 2**12
 """Number of points per call of the host's normal smoothing, which evaluates 32 neighbours of each. It bounds
@@ -117,19 +118,17 @@ def _kept(
 
 @torch.no_grad()
 def shading_normals(
-    host: object, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
+    model: NeilfModel, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3"]:
-    """Normals that a host uses for shading, smoothed if it smooths them.
+    """Normals that a model uses for shading.
 
     Args:
-        host: the host.
+        model: the model.
         position: any number of points on the surface, scene frame.
-        normal: their unit normals, not smoothed.
+        normal: unit normals of the geometry there.
     """
-    if not isinstance(host, SmoothsNormals):
-        return normal
     pairs = zip(position.split(NORMALS_AT_ONCE), normal.split(NORMALS_AT_ONCE), strict=True)
-    return torch.cat([host.smooth_normals(x, n) for x, n in pairs])
+    return torch.cat([model.shading_normals(x, n) for x, n in pairs])
 
 
 def _extract(run: Run, resolution: int) -> ExtractedSurface:
@@ -148,7 +147,7 @@ def _with_normals(run: Run, surface: ExtractedSurface) -> ExtractedSurface:
         torch.from_numpy(np.array(values, np.float32)).to(run.device)
         for values in (surface.vertices, surface.mesh().vertex_normals)
     )
-    return replace(surface, normals=shading_normals(run.model.host, position, normal).cpu().numpy())
+    return replace(surface, normals=shading_normals(run.model, position, normal).cpu().numpy())
 
 
 # --------------------------------------------------------------------------------------------------- the file
@@ -162,18 +161,17 @@ def _fingerprint(run: Run, resolution: int) -> str | None:
     host, config = run.model.host, run.config
     if not isinstance(host, VolSdfHost):
         return None
-    radii = (config.background.radius, config.host.volume.normal_radius)
-    settings = (FORMAT, __version__, resolution, *radii, run.device.type)
+    settings = (FORMAT, __version__, resolution, config.background.radius, run.device.type)
     digest = hashlib.sha256(repr(settings).encode())
-    for name, tensor in _distance_tensors(host):
+    for name, tensor in _surface_tensors(run.model, host):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(np.ascontiguousarray(tensor.detach().cpu().numpy()).data)
     return digest.hexdigest()
 
 
-def _distance_tensors(host: VolSdfHost) -> Iterator[tuple[str, Tensor]]:
-    """The tensors that determine `host.sdf`: the weights of G, and the free space around the cameras."""
-    for part in filter(None, (host.sdf_field, host.free_space)):
+def _surface_tensors(model: NeilfModel, host: VolSdfHost) -> Iterator[tuple[str, Tensor]]:
+    """The weights of G, the free space around the cameras, and the tilts of normals."""
+    for part in filter(None, (host.sdf_field, host.free_space, model.tilts)):
         yield from part.named_parameters()
         yield from part.named_buffers()
 

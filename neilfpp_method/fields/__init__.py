@@ -3,6 +3,16 @@
 from neilfpp_method.fields.brdf import BrdfField
 from neilfpp_method.fields.exposure import PhotographGains, at_mean_exposure
 from neilfpp_method.fields.light import LightModel, make_light
+from neilfpp_method.fields.normal_tilts import NormalTilts, tilted
 from neilfpp_method.fields.poses import PoseCorrections
 
-__all__ = ["BrdfField", "LightModel", "PhotographGains", "PoseCorrections", "at_mean_exposure", "make_light"]
+__all__ = [
+    "BrdfField",
+    "LightModel",
+    "NormalTilts",
+    "PhotographGains",
+    "PoseCorrections",
+    "at_mean_exposure",
+    "make_light",
+    "tilted",
+]

@@ -42,6 +42,8 @@ SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
 """Width ε of the smoothed delta of L_surf by `host.loss.points`, scene units; that of "scene" is the
 published value.
 """
+NORMAL_RADIUS = 0.08
+"""Radius within which normals are smoothed for shading, scene units."""
 GRID_LIFE = 100
 """Training steps of the geometry after which the distance grid is sampled again."""
 SPARE_WEIGHT = 1e-6
@@ -185,11 +187,8 @@ class VolSdfHost(nn.Module):
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]
     ) -> Float[Tensor, "N 3"]:
-        """Normals smoothed within `host.volume.normal_radius` of hits; the hit normals if it is 0."""
-        radius = self.config.host.volume.normal_radius
-        if radius == 0:
-            return normal
-        return smooth_normals(lambda x: self._surface(x).gradient, position, normal, radius)
+        """Normals smoothed within `NORMAL_RADIUS` of hits, except across edges."""
+        return smooth_normals(lambda x: self._surface(x).gradient, position, normal, NORMAL_RADIUS)
 
     @torch.no_grad()
     def may_hit(self, rays: RayBatch) -> Bool[Tensor, " N"]:

@@ -22,7 +22,7 @@ def surface_of_run(
 ) -> Surface:
     """Return the mesh the run was given, or the one that `neilfpp export --what mesh` extracts.
 
-    Shading normals are those of training: the host's normals, smoothed if the host smooths them.
+    Shading normals are those of training (`NeilfModel.shading_normals`).
 
     Args:
         run: the trained run.
@@ -36,7 +36,7 @@ def surface_of_run(
     host = run.model.host
     if isinstance(host, MeshHost):
         triangles, normals = host.triangles.float(), host.corner_normals.float()
-        smooth = shading_normals(host, triangles.reshape(-1, 3), normals.reshape(-1, 3))
+        smooth = shading_normals(run.model, triangles.reshape(-1, 3), normals.reshape(-1, 3))
         return Surface(triangles, smooth.view_as(triangles))
     if not isinstance(host, HasSdf):
         raise UserError(

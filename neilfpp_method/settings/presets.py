@@ -131,8 +131,8 @@ FAST: Mapping[str, Any] = {
     "host.volume.beta_final": 0.002,
     "host.volume.skip_empty": True,
     "host.volume.samples": 32,
-    "host.volume.normal_radius": 0.08,
     "shading.lobe": "ggx",
+    "shading.normals": "refined",
     "shading.sampler": "mis",
     "shading.train_samples": 64,
     "shading.eval_samples": 128,
@@ -272,7 +272,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     - Stages: R is trained first for a few steps, because light between surfaces influences the choice of the
       light; then R, B and L are trained together, in the steps of both other stages.
     - R gets no feature of G, so it encodes positions itself; 8×128 is the paper's surface light field.
-    - The normals are given: they are not smoothed, and R need not support their recovery.
+    - The normals are given: they are not refined, and R need not support their recovery.
     - Rays through a mesh are cheap, so the light is solved for more often.
     """
     train = config.train
@@ -280,6 +280,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
         "preset": f"{config.preset}-mesh",
         "host": {"kind": MeshConfig().kind},
         "radiance": {"positions": "encoded", "layers": 8, "width": 128, "direction": "outgoing"},
+        "shading.normals": "host",
         "loss.lambertian": 10.0 * config.loss.lambertian,
         "train.sdf_steps": train.sdf_steps // 10,
         "train.material_steps": train.material_steps + train.joint_steps,

@@ -190,7 +190,7 @@ class BackgroundConfig:
 
 @dataclass(frozen=True)
 class VolumeConfig:
-    """Volume rendering of G, and normals of what is rendered (METHOD §3)."""
+    """Volume rendering of G (METHOD §3)."""
 
     beta_init: float = 0.1
     """Initial scale β of the Laplace density."""
@@ -202,8 +202,6 @@ class VolumeConfig:
     """
     samples: int = 98
     """Rendered samples per ray: two thirds by opacity, the rest spread over the whole ray with both ends."""
-    normal_radius: float = 0.0
-    """Radius within which normals are smoothed for shading, except across edges. 0: no smoothing."""
 
 
 @dataclass(frozen=True)
@@ -274,6 +272,10 @@ class ShadingConfig:
     """
     specular: bool = True
     """Whether surfaces reflect specularly. If False, they are Lambertian, without roughness and metallic."""
+    normals: Literal["host", "refined"] = "host"
+    """Normals for shading. host: as the geometry has them. refined: smoothed except across edges, if the host
+    can do that, and tilted by a coarse field that is learned with the material.
+    """
     sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"
     """Sampling of incident directions. fibonacci: the paper's lattice. cosine: by cosine. lobe: by the
     specular lobe. mis: by the light and the lobe, combined by the balance heuristic. no_lobe: by the light.

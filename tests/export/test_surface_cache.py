@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import resource
 import shutil
@@ -17,7 +16,6 @@ import torch
 from neilfpp_method.export import surface_cache
 from neilfpp_method.export.surface_cache import ShadedSurface, extracted_surface, shaded_surface
 from neilfpp_method.relight.recovered import surface_of_run
-from neilfpp_method.settings.plain import changed
 from neilfpp_method.train.run import Run, load_run
 from tests.calls import train_tiny
 from tests.train.small_runs import few_steps
@@ -98,12 +96,13 @@ def _weights(run: Run) -> Run:
     return run
 
 
-def _normal_radius(run: Run) -> Run:
-    radius = run.config.host.volume.normal_radius + 0.01
-    return dataclasses.replace(run, config=changed(run.config, {"host.volume.normal_radius": radius}))
+def _tilts(run: Run) -> Run:
+    with torch.no_grad():
+        run.model.tilts.grid.add_(0.1)
+    return run
 
 
-@pytest.mark.parametrize("change", [_weights, _normal_radius])
+@pytest.mark.parametrize("change", [_weights, _tilts])
 def test_what_determines_the_surface_makes_the_file_stale(run, extractions, change):
     shaded(run)
     changed, said = change(run), []

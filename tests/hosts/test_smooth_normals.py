@@ -67,10 +67,10 @@ def test_an_empty_batch_of_points():
     assert smooth_normals(lambda x: x, none, none, RADIUS).shape == (0, 3)
 
 
-def test_a_radius_of_zero_evaluates_no_neighbors():
+def test_normals_of_the_host_evaluate_no_neighbors():
     config = tiny_config()
-    for radius, expected in ((0.0, 0), (RADIUS, NEIGHBORS)):
-        model = sphere_model(changed(config, {"host.volume.normal_radius": radius}))
+    for normals, expected in (("host", 0), ("refined", NEIGHBORS)):
+        model = sphere_model(changed(config, {"shading.normals": normals}))
         hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
         asked = []
         original = model.host.sdf_field.with_gradient
@@ -82,7 +82,7 @@ def test_a_radius_of_zero_evaluates_no_neighbors():
 
 
 def test_the_gradient_is_that_of_the_hit_normals():
-    model = sphere_model(changed(tiny_config(), {"host.volume.normal_radius": RADIUS}))
+    model = sphere_model()
     hits = model.host.render(sphere_batch(spread=0.3).rays).detach()
     normal = hits.normal.clone().requires_grad_()
     weight = torch.randn_like(normal)

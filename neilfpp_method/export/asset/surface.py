@@ -62,7 +62,7 @@ def fine_surface(run: Run, resolution: int, say: Callable[[str], None] = lambda 
     if isinstance(host, MeshHost):
         mesh = surface_mesh(run)
         position, normal = host.triangles.reshape(-1, 3), host.corner_normals.reshape(-1, 3)
-        normals = shading_normals(host, position, normal).double().cpu().numpy().reshape(-1, 3, 3)
+        normals = shading_normals(run.model, position, normal).double().cpu().numpy().reshape(-1, 3, 3)
         return AssetSurface(np.array(mesh.vertices, np.float64), np.array(mesh.faces), normals)
     surface = shaded_surface(run, resolution, say)
     faces = surface.faces.astype(np.int64)
