@@ -54,9 +54,12 @@ __all__ = ["EVAL_RAYS", "NeilfModel"]
 EVAL_RAYS = 2048
 """Largest number of rays in one call of `NeilfModel.maps`; their incident directions must fit in memory."""
 CLEAR_OPACITY = 0.01
-"""Opacity below which a ray counts as missing the scene, so that its pixel shows the light behind it."""
+"""Opacity below which a ray counts as missing the scene: its pixel shows what lies behind, and no material.
+"""
 SURFACE_OPACITY = 0.5
-"""Opacity above which `maps` shades a ray. Edges that mix two surfaces count, too: images have no holes."""
+"""Opacity above which `maps` shades a ray. Edges that mix two surfaces count, too: images have no holes. A
+pixel that shows mostly what lies behind the surface keeps the colour of the host.
+"""
 
 
 class NeilfModel(nn.Module):
@@ -353,21 +356,17 @@ class NeilfModel(nn.Module):
         """
         hits = self.host.render(rays) if hits is None else hits.detach()
         maps = Maps.of_host(rays, hits)
-        rows = torch.nonzero(hits.opacity > SURFACE_OPACITY)[:, 0]
+        rows = torch.nonzero(hits.opacity > CLEAR_OPACITY)[:, 0]
         if not len(rows):
             return maps
         position, wo = hits.position[rows], -rays.directions[rows]
-        normal = self.shading_normals(position, hits.normal[rows])
-        material = self.brdf(position)
-        shading = self.shade(position, normal, wo, material, self.config.shading.eval_samples)
-        found = {"rgb": shading.color, "diffuse": shading.diffuse, "specular": shading.specular}
-        found |= {name: getattr(material, name) for name in ("base_color", "roughness", "metallic")}
-        found["normal"] = normal
-
-        def on_surface(name: str, whole: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
-            return whole.index_put((rows,), found[name].to(whole.dtype)) if name in found else whole
-
-        return maps.map_named(on_surface)
+        normal, material = self.shading_normals(position, hits.normal[rows]), self.brdf(position)
+        maps = maps.with_rows(rows, normal=normal, **vars(material))
+        solid = torch.nonzero(hits.opacity[rows] > SURFACE_OPACITY)[:, 0]
+        samples = self.config.shading.eval_samples
+        shading = self.shade(position[solid], normal[solid], wo[solid], material[solid], samples)
+        parts = {"rgb": shading.color, "diffuse": shading.diffuse, "specular": shading.specular}
+        return maps.with_rows(rows[solid], **parts)
 
     # --------------------------------------------------------------------------------------------- parameters
 

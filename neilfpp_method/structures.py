@@ -349,12 +349,13 @@ class Maps(Indexable):
     """All maps of an image, one row per ray; colours are linear RGB.
 
     Attributes:
-        rgb: colour by the rendering equation; equal to `rgb_volume` for a ray without a surface.
+        rgb: colour by the rendering equation; equal to `rgb_volume` if the opacity is at most one half.
         rgb_volume: colour that the host renders.
-        diffuse, specular: the two parts of the shaded radiance; 0 without a surface.
-        base_color, roughness, metallic: the material, each in [0, 1]; 0 without a surface.
-        normal: unit normal in the scene frame, as used for shading; the host's blended normal without a
-            surface.
+        diffuse, specular: the two parts of the shaded radiance; 0 if the opacity is at most one half.
+        base_color, roughness, metallic: the material, each in [0, 1], not multiplied by the opacity; 0 if the
+            opacity is at most 0.01.
+        normal: unit normal in the scene frame, as used for shading; the host's blended normal where there is
+            no material.
         depth: distance of the hit along the ray, scene units.
         opacity: sum of the rendering weights, in [0, 1].
     """
@@ -387,3 +388,8 @@ class Maps(Indexable):
             depth=depth,
             opacity=hits.opacity[:, None],
         )
+
+    def with_rows(self, rows: Int[Tensor, " M"], **values: Float[Tensor, "M _"]) -> Maps:
+        """The same maps, with other values at some rows of the named maps."""
+        put = {k: getattr(self, k).index_put((rows,), v.to(self.rgb.dtype)) for k, v in values.items()}
+        return replace(self, **put)

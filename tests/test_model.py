@@ -128,6 +128,18 @@ def test_pbr_color_of_a_white_furnace():
     torch.testing.assert_close(maps.rgb, maps.base_color, atol=1e-4, rtol=0.0)
 
 
+@pytest.mark.parametrize(("opacity", "material", "shaded"), [(0.9, 1, 1), (0.3, 1, 0), (0.005, 0, 0)])
+def test_a_pixel_that_a_silhouette_partly_covers_has_the_material(opacity, material, shaded):
+    """Its colour is that of the host, which mixes the object with what lies behind."""
+    model = sphere_model().eval()
+    rays = sphere_batch(spread=0.3).rays
+    hits = model.host.render(rays).detach()
+    maps = model.maps(rays, dataclasses.replace(hits, opacity=torch.full_like(hits.opacity, opacity)))
+    assert bool(maps.base_color.any()) == bool(material)
+    assert torch.equal(maps.rgb, maps.rgb_volume) == (not shaded)
+    assert bool(maps.specular.any()) == bool(shaded)
+
+
 class Room:
     """A host: a closed room whose walls, 2 scene units from the origin, have their own normal as radiance."""
 

@@ -1,4 +1,4 @@
-"""Faults of patches, light fits, relighting, files, health and attached hosts."""
+"""Faults of patches, tilts, light fits, relighting, files, health and attached hosts."""
 
 from __future__ import annotations
 
@@ -23,6 +23,20 @@ LATER_FAULTS: Sequence[Mutant] = (
         "own - own.mean(-1, keepdim=True), other - other.mean(-1, keepdim=True)",
         "own, other",
         "hosts/test_patches.py",
+    ),
+    Mutant(
+        "tilts of normals get no gradient of the image",
+        "model.py",
+        "tilted(refined, self.tilts(position))",
+        "tilted(refined, self.tilts(position).detach())",
+        "fields/test_normal_tilts.py",
+    ),
+    Mutant(
+        "a point with a huge gradient determines how normals are tilted",
+        "fields/normal_tilts.py",
+        "MAX_GRADIENT * length.median()",
+        "length.max()",
+        "fields/test_normal_tilts.py",
     ),
     Mutant(
         "the gradient of a light fit contains the rows of one thread",
