@@ -105,7 +105,8 @@ class NeilfModel(nn.Module):
         self.check_outputs = OutputCheck(host, config.shading.hit_share, may_be_constant=borrowed)
         self.observers: list[Callable[[PixelBatch, SurfaceHits], None]] = []
         self.brdf = BrdfField(config.brdf, config.encoding, config.background.radius)
-        self.tilts = NormalTilts() if config.shading.normals == "refined" else None
+        refines = config.shading.normals == "refined" and isinstance(host, SmoothsNormals)
+        self.tilts = NormalTilts() if refines else None
         has_gains = config.optimizer.exposure > 0 and len(facts.log_gains) > 0
         self.gains = PhotographGains(torch.tensor(facts.log_gains).view(-1, 3)) if has_gains else None
         self.poses: PoseCorrections | None = None
@@ -256,7 +257,7 @@ class NeilfModel(nn.Module):
             material = self.brdf(surface.position)
         if "lambertian" in active:
             priors["lambertian"] = losses.lambertian(material)
-        if "tilt" in active:
+        if self.tilts is not None:
             priors["tilt"] = losses.tilt(self.tilts(surface.position))
         return material, priors
 
@@ -319,10 +320,8 @@ class NeilfModel(nn.Module):
         """Unit normals for shading, refined if the settings say so, with the gradient of `normal`."""
         if self.tilts is None:
             return normal
-        refined = normal.detach()
-        if isinstance(self.host, SmoothsNormals):
-            refined = self.host.smooth_normals(position.detach(), refined)
-        return tilted(refined, self.tilts(position)) + (normal - normal.detach())
+        smooth = self.host.smooth_normals(position.detach(), normal.detach())
+        return tilted(smooth, self.tilts(position)) + (normal - normal.detach())
 
     def incident_light(self, x: Float[Tensor, "N 3"], wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S 3"]:
         """Linear radiance at x from wi: of the light, the lamps, or a surface that occludes them."""

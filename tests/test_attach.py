@@ -109,7 +109,7 @@ def test_before_the_material_stage_the_host_is_not_rendered():
 def test_steps_fall_into_the_stages_of_the_settings():
     neilf = attach_neilf(Ball(), steps(sdf=2, material=3, joint=1))
     names = [set(neilf.losses(pixels(), step).terms) for step in (1, 2, 4, 5, 99)]
-    material = {"physical", "inter_reflection", "smoothness", "tilt"}
+    material = {"physical", "inter_reflection", "smoothness"}
     assert [n - {"lambertian"} for n in names] == [
         set(),
         material,

@@ -27,8 +27,8 @@ LATER_FAULTS: Sequence[Mutant] = (
     Mutant(
         "tilts of normals get no gradient of the image",
         "model.py",
-        "tilted(refined, self.tilts(position))",
-        "tilted(refined, self.tilts(position).detach())",
+        "tilted(smooth, self.tilts(position))",
+        "tilted(smooth, self.tilts(position).detach())",
         "fields/test_normal_tilts.py",
     ),
     Mutant(

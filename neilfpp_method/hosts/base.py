@@ -153,7 +153,9 @@ class StartsFromShape(Protocol):
 
 @runtime_checkable
 class SmoothsNormals(Protocol):
-    """A host that can smooth its normals for shading. Without it surfaces are shaded with the hit normals."""
+    """A host whose normals have errors that shading should correct: it smooths them, and the model tilts
+    them. Without it surfaces are shaded with the hit normals.
+    """
 
     def smooth_normals(
         self, position: Float[Tensor, "N 3"], normal: Float[Tensor, "N 3"]

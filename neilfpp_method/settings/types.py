@@ -273,8 +273,8 @@ class ShadingConfig:
     specular: bool = True
     """Whether surfaces reflect specularly. If False, they are Lambertian, without roughness and metallic."""
     normals: Literal["host", "refined"] = "host"
-    """Normals for shading. host: as the geometry has them. refined: smoothed except across edges, if the host
-    can do that, and tilted by a coarse field that is learned with the material.
+    """Normals for shading. host: as the geometry has them. refined: smoothed except across edges, and tilted
+    by a coarse field that is learned with the material; only for hosts that can smooth their normals.
     """
     sampler: Literal["fibonacci", "cosine", "lobe", "mis", "no_lobe"] = "fibonacci"
     """Sampling of incident directions. fibonacci: the paper's lattice. cosine: by cosine. lobe: by the

@@ -104,14 +104,15 @@ def test_a_strict_command_ends_with_status_1_if_the_surface_stays_soft_and_keeps
 
 
 def test_a_light_that_is_far_too_dim_is_worse_than_one_color(capture, tmp_path):
-    """One colour has 13.1 dB, the rendering 15.2 dB with a bright light and 5.4 dB with a hundredth of it."""
+    """One colour has 13.1 dB, the rendering 5.2 dB under a hundredth of a bright light."""
     quick = {"optimizer.brdf": 0.1, "train.sdf_steps": 2, "train.material_steps": 30, "train.joint_steps": 0}
-    known = {"light.kind": "distant", "light.inter_reflection": "off"}
+    # Light that is the same from all directions says nothing of the roughness, so there is none.
+    known = {"light.kind": "distant", "light.inter_reflection": "off", "shading.specular": False}
     config = changed(solved_light(tiny_config()), {**quick, **known})
     for radiance, status in ((3.0, 0), (0.03, 1)):
         sky, out = tmp_path / f"{radiance}.exr", tmp_path / f"{radiance}"
         write_exr(sky, {"RGB": np.full((4, 8, 3), radiance, np.float32)})
         assert command(capture, out, config, "--light", sky) == status
         severe = {finding.case: finding.severe for finding in read_findings(out)}
-        expected = {"worse_than_constant": True, "material_at_bounds": True, "roughness_at_bound": False}
+        expected = {"worse_than_constant": True, "material_at_bounds": True}
         assert severe == (expected if status else {})
