@@ -1,8 +1,8 @@
 """A field of small tilts that corrects the normals of a recovered surface for shading.
 
 The normals of a surface that was recovered from images are off by a few degrees over areas much larger than
-a pixel. A highlight moves by twice that angle, so B would have to explain in each pixel what the normal does
-wrong. A coarse field can correct the normals, but it is too coarse to imitate texture by shading.
+a pixel. A highlight moves by twice that angle, and without correction B compensates for it with a wrong
+material. A coarse field can correct the normals, but it is too coarse to imitate texture by shading.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ __all__ = ["NormalTilts", "tilted"]
 VERTICES = 24
 """Vertices of the grid along each edge of the cube [−1, 1]³, which contains the object."""
 UNIT = 0.1
-"""Radians per unit of a parameter. With the learning rate of B, a step of Adam then turns by about 0.06°."""
+"""Radians per unit of a parameter. At the learning rate of B in `fast`, 0.01, a step of Adam changes each
+component of the tilt by about 0.06°.
+"""
 MAX_GRADIENT = 3.0
 """Length of the gradient of a point, relative to the median of the batch, to which longer ones are scaled. A
 few samples of sharp lobes would otherwise determine the step.
