@@ -5,9 +5,8 @@
     material init    x     -     -     -      -      -     x      x      x   | B, L
     joint            x     x     x     low    low    -     x      x      x   | G, R, B, L
 
-"low" means a lower weight than in SDF init (`LOWERED` for L_surf, a setting for L_Hess). Presets made for
-photographs add L_patch in SDF init. If photographs have gains of their own, the prior on the gains is active
-whenever L_vol is.
+"low" means a lower weight than in SDF init. Presets made for photographs add L_patch in SDF init. If
+photographs have gains of their own, the prior on the gains is active whenever L_vol is.
 
 Two more tables are for hosts whose geometry is not trained here. With given geometry (`FIXED_GEOMETRY`), R is
 a surface light field and is trained together with the material. For a host that belongs to another trainer
@@ -78,9 +77,6 @@ TILT_PRIOR = 1.0
 that do not smooth their normals have no tilts, and this loss is not computed for them.
 """
 
-LOWERED = 0.1
-"""Factor on the weight of L_surf in the joint stage (published code)."""
-
 MATERIAL_LOSSES = {name: name for name in ("smoothness", "lambertian")}
 """Priors of the material stages, with the settings that hold their weights."""
 
@@ -94,7 +90,6 @@ class StagePlan:
             `LossConfig`. The weights of the other losses are fixed (`active_losses`).
         trains: parameter groups that the stage trains.
         geometry_weights: for each loss that only trains G, the name of its setting in `GeometryLossConfig`.
-        lowered: those of them whose weight is multiplied by `LOWERED`.
         grows: for each of them whose weight changes during the stage, the setting with the factor by which
             it has changed at the end of the stage.
     """
@@ -102,7 +97,6 @@ class StagePlan:
     weights: Mapping[str, str]
     trains: frozenset[str]
     geometry_weights: Mapping[str, str] = field(default_factory=dict)
-    lowered: frozenset[str] = frozenset()
     grows: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -140,9 +134,8 @@ STAGES: StageTable = {
             "mask": "mask",
             "eikonal": "eikonal",
             "hessian": "hessian_joint",
-            "surface": "surface",
+            "surface": "surface_joint",
         },
-        lowered=frozenset({"surface"}),
     ),
 }
 
@@ -305,9 +298,8 @@ def active_losses(
 def _geometry_weights(plan: StagePlan, settings: GeometryLossConfig, share: float) -> dict[str, float]:
     """Weights of the losses that only train G, after a share of the stage."""
     weights = {loss: getattr(settings, setting) for loss, setting in plan.geometry_weights.items()}
-    factors = {loss: getattr(settings, setting) ** share for loss, setting in plan.grows.items()}
-    factors |= dict.fromkeys(plan.lowered, LOWERED)
-    return {loss: weight * factors.get(loss, 1.0) for loss, weight in weights.items()}
+    grown = {loss: getattr(settings, setting) ** share for loss, setting in plan.grows.items()}
+    return {loss: weight * grown.get(loss, 1.0) for loss, weight in weights.items()}
 
 
 @dataclass(frozen=True)

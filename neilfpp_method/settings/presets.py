@@ -143,6 +143,7 @@ FAST: Mapping[str, Any] = {
     "host.loss.hessian_growth": 8.0,
     "host.loss.hessian_joint": 1.6e-3,
     "host.loss.surface": 1e-2,
+    "host.loss.surface_joint": 1e-3,
     "host.loss.point_cloud": 0.1,
     "host.loss.patches": 0.5,
     "host.loss.mask": 1.0,

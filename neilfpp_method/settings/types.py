@@ -217,7 +217,9 @@ class GeometryLossConfig:
     hessian_joint: float = 1e-4
     """Weight of L_Hess in the joint stage."""
     surface: float = 1e-3
-    """Weight of L_surf (no unseen surfaces) in SDF init; a tenth of it in the joint stage."""
+    """Weight of L_surf (no unseen surfaces) in SDF init."""
+    surface_joint: float = 1e-4
+    """Weight of L_surf in the joint stage."""
     point_cloud: float = 0.0
     """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
     patches: float = 0.0
