@@ -148,7 +148,7 @@ class PlainHost(VolSdfHost):
                 break
             shares = bound_shares(partition, wide)
             partition = with_cuts(self.sdf, rays, partition, shares, counts.cuts, self.training)
-        return opacity_samples(partition, wide, counts.rendered, self.training)
+        return opacity_samples(partition, wide, counts, self.training)
 
 
 def straightforward(model: NeilfModel) -> NeilfModel:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 from jaxtyping import Float
@@ -89,15 +89,12 @@ class StagePlan:
         weights: for each loss of every host whose weight is a setting, the name of that setting in
             `LossConfig`. The weights of the other losses are fixed (`active_losses`).
         trains: parameter groups that the stage trains.
-        geometry_weights: for each loss that only trains G, the name of its setting in `GeometryLossConfig`.
-        grows: for each of them whose weight changes during the stage, the setting with the factor by which
-            it has changed at the end of the stage.
+        geometry_losses: the losses that only train G, whose weights are in `GeometryLossConfig`.
     """
 
     weights: Mapping[str, str]
     trains: frozenset[str]
-    geometry_weights: Mapping[str, str] = field(default_factory=dict)
-    grows: Mapping[str, str] = field(default_factory=dict)
+    geometry_losses: tuple[str, ...] = ()
 
     @property
     def trains_host(self) -> bool:
@@ -116,26 +113,13 @@ STAGES: StageTable = {
     Stage.SDF_INIT: StagePlan(
         weights={"volume": "volume"},
         trains=GEOMETRY,
-        geometry_weights={
-            "mask": "mask",
-            "eikonal": "eikonal",
-            "hessian": "hessian",
-            "surface": "surface",
-            "point_cloud": "point_cloud",
-            "patches": "patches",
-        },
-        grows={"hessian": "hessian_growth"},
+        geometry_losses=("mask", "eikonal", "hessian", "surface", "point_cloud", "patches"),
     ),
     Stage.MATERIAL_INIT: StagePlan(weights=MATERIAL_LOSSES, trains=MATERIAL),
     Stage.JOINT: StagePlan(
         weights={"volume": "volume", **MATERIAL_LOSSES},
         trains=GEOMETRY | MATERIAL,
-        geometry_weights={
-            "mask": "mask",
-            "eikonal": "eikonal",
-            "hessian": "hessian_joint",
-            "surface": "surface_joint",
-        },
+        geometry_losses=("mask", "eikonal", "hessian", "surface"),
     ),
 }
 
@@ -276,7 +260,11 @@ def active_losses(
     plan = stages[stage]
     weights = {loss: getattr(config.loss, setting) for loss, setting in plan.weights.items()}
     if config.geometry_loss is not None:
-        weights |= _geometry_weights(plan, config.geometry_loss, share)
+        changing = _changing_weights(stage, config.geometry_loss, share)
+        weights |= {
+            loss: changing[loss] if loss in changing else getattr(config.geometry_loss, loss)
+            for loss in plan.geometry_losses
+        }
     if plan.trains_material:
         weights["physical"] = 1.0
         if config.light.inter_reflection == "soft":
@@ -295,11 +283,12 @@ def active_losses(
     return {loss: weight for loss, weight in weights.items() if weight > 0}
 
 
-def _geometry_weights(plan: StagePlan, settings: GeometryLossConfig, share: float) -> dict[str, float]:
-    """Weights of the losses that only train G, after a share of the stage."""
-    weights = {loss: getattr(settings, setting) for loss, setting in plan.geometry_weights.items()}
-    grown = {loss: getattr(settings, setting) ** share for loss, setting in plan.grows.items()}
-    return {loss: weight * grown.get(loss, 1.0) for loss, weight in weights.items()}
+def _changing_weights(stage: Stage, settings: GeometryLossConfig, share: float) -> dict[str, float]:
+    """Weights of the losses of G that depend on the stage, after a share of it."""
+    start, end, in_joint = settings.hessian
+    if stage is Stage.JOINT:
+        return {"hessian": in_joint, "surface": settings.surface[1]}
+    return {"hessian": start ** (1.0 - share) * end**share, "surface": settings.surface[0]}
 
 
 @dataclass(frozen=True)

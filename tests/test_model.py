@@ -73,7 +73,7 @@ def test_an_effect_that_is_off_makes_no_queries():
     first_stage = count_queries(model, lambda: model.losses(batch, Stage.SDF_INIT))
     assert first_stage["brdf"] == first_stage["light"] == 0
 
-    plain = sphere_model(changed(base, {"host.loss.hessian": 0.0}))
+    plain = sphere_model(changed(base, {"host.loss.hessian": (0.0, 0.0, 0.0)}))
     fewer = count_queries(plain, lambda: plain.losses(batch, Stage.SDF_INIT))
     assert fewer["sdf"] < first_stage["sdf"]
 

@@ -47,12 +47,11 @@ def test_the_joint_stage_lowers_hessian_and_surface():
 def test_the_weight_of_the_hessian_grows_only_in_sdf_init():
     config = preset("fast")
     weights = [active_losses(Stage.SDF_INIT, config, share=share) for share in (0.0, 0.5, 1.0)]
-    growth = config.host.loss.hessian_growth
-    assert growth > 1
-    assert weights[1]["hessian"] == pytest.approx(weights[0]["hessian"] * growth**0.5)
-    assert weights[2]["hessian"] == pytest.approx(weights[0]["hessian"] * growth)
+    start, end, in_joint = config.host.loss.hessian
+    assert end > start
+    assert [w["hessian"] for w in weights] == pytest.approx([start, (start * end) ** 0.5, end])
     assert [w["eikonal"] for w in weights] == [config.host.loss.eikonal] * 3
-    assert active_losses(Stage.JOINT, config, share=1.0)["hessian"] == config.host.loss.hessian_joint
+    assert active_losses(Stage.JOINT, config, share=1.0)["hessian"] == in_joint
 
 
 @pytest.mark.parametrize("stage", Stage)

@@ -23,7 +23,7 @@ from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.timing.ledger import timed
 from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
-from neilfpp_method.volume.density import LaplaceDensity, laplace_depth
+from neilfpp_method.volume.density import LaplaceDensity
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
@@ -103,7 +103,7 @@ class VolSdfHost(nn.Module):
         sdf, volume = config.host.sdf, config.host.volume
         self.sdf_field = SdfField(sdf, config.encoding, radius)
         self.radiance_field = radiance_field(config, facts, sdf.feature_width)
-        self.density = LaplaceDensity(volume.beta_init)
+        self.density = LaplaceDensity(volume.beta_init, kind=volume.density)
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
         self.cameras = cameras
@@ -369,7 +369,7 @@ class VolSdfHost(nn.Module):
     def _mask_loss(self, march: March, batch: PixelBatch) -> LossTerm:
         """The mask loss, with β detached: it must move surfaces, not widen them."""
         beta, distance = self.density.beta().detach(), march.surface.distance.view_as(march.distances)
-        depth = laplace_depth(distance, march.distances, beta).sum(-1)
+        depth = self.density.depth(distance, march.distances, beta).sum(-1)
         return losses.mask(depth, batch.mask, batch.mask_known, beta)
 
     def _regularizer_inputs(self, march: March) -> RegularizerInputs:

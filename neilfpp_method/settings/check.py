@@ -69,9 +69,16 @@ def _is_positive(value: float) -> bool:
 
 
 def _check_not_negative(config: NeilfConfig, group: str) -> None:
-    """Check all numbers of a group."""
+    """Check all numbers of a group, those in tuples too."""
     for name, value in asdict(attrgetter(group)(config)).items():
-        if isinstance(value, int | float):
+        if isinstance(value, tuple):
+            _require(
+                lambda numbers: all(0 <= number < math.inf for number in numbers),
+                config,
+                f"{group}.{name}",
+                "numbers of 0 or more",
+            )
+        elif isinstance(value, int | float):
             _require(lambda number: 0 <= number < math.inf, config, f"{group}.{name}", "0 or more")
 
 

@@ -192,6 +192,10 @@ class BackgroundConfig:
 class VolumeConfig:
     """Volume rendering of G (METHOD §3)."""
 
+    density: Literal["isotropic", "entering"] = "isotropic"
+    """isotropic: the density of VolSDF. entering: a density only where G falls along the ray, which does not
+    make rays opaque that pass a surface at a distance of a few β.
+    """
     beta_init: float = 0.1
     """Initial scale β of the Laplace density."""
     beta_final: float = 0.0
@@ -210,16 +214,12 @@ class GeometryLossConfig:
 
     eikonal: float = 0.1
     """Weight of L_Eik: gradients of G have length 1."""
-    hessian: float = 1e-3
-    """Weight of L_Hess (little curvature of G) at the start of SDF init."""
-    hessian_growth: float = 1.0
-    """Factor on the weight of L_Hess at the end of SDF init. A low weight first lets the shape form."""
-    hessian_joint: float = 1e-4
-    """Weight of L_Hess in the joint stage."""
-    surface: float = 1e-3
-    """Weight of L_surf (no unseen surfaces) in SDF init."""
-    surface_joint: float = 1e-4
-    """Weight of L_surf in the joint stage."""
+    hessian: tuple[float, float, float] = (1e-3, 1e-3, 1e-4)
+    """Weights of L_Hess (little curvature of G): at the start and at the end of SDF init, and in the joint
+    stage. A low weight at the start lets the shape form.
+    """
+    surface: tuple[float, float] = (1e-3, 1e-4)
+    """Weights of L_surf (no unseen surfaces): in SDF init, and in the joint stage."""
     point_cloud: float = 0.0
     """Weight of L_pcd, the distance to an oriented point cloud, in SDF init."""
     patches: float = 0.0

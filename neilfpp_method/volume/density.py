@@ -1,6 +1,19 @@
-"""Density from signed distance: the Laplace density of VolSDF (METHOD §3)."""
+"""Density from signed distance: the Laplace density of VolSDF (METHOD §3), and one that acts at entry only.
+
+The density of VolSDF is isotropic, so the opacity of a ray grows with the length of its path through the
+layer of a few β around a surface. With β = 0.005, a ray that passes a sphere of radius 0.5 at a distance of
+3 β is half opaque, although a ray that hits the sphere head-on is so at the surface. Images fix where rays
+become opaque, and most parts of an object form its outline in some image: their surface then lies too deep by
+a few β.
+
+The entering density acts only where the signed distance falls along the ray. The opacity of a ray then
+depends on its smallest distance alone, from whichever direction it comes. It is the density of NeuS (Wang et
+al. 2021) with the Laplace instead of the logistic distribution.
+"""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -8,7 +21,7 @@ from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["LaplaceDensity", "laplace_density", "laplace_depth"]
+__all__ = ["LaplaceDensity", "entering_depth", "laplace_density", "laplace_depth"]
 
 SIMPSON_BELOW = 0.03
 """Difference of the signed distance over an interval, in units of β, below which Simpson's rule replaces the
@@ -67,10 +80,7 @@ def laplace_depth(
         tensor([5.])
     """
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
-    outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
-    # The differences of both terms of F are taken separately: deep inside, the first term is large and would
-    # absorb the second.
-    rise = inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
+    rise = _antiderivative_differences(scaled)
     step = scaled.diff(dim=-1)
     close = step.abs() < SIMPSON_BELOW
     # The divisor is 1 where the quotient is not used: an unused branch must not make the gradient NaN.
@@ -83,18 +93,62 @@ def laplace_depth(
     return torch.where(close, simpson, quotient) * distances.diff(dim=-1).clamp_min(0.0) / beta
 
 
+def entering_depth(
+    sdf: Float[Tensor, "*shape M"], beta: Float[Tensor, "*#shape"]
+) -> Float[Tensor, "*shape M-1"]:
+    """Optical depth between neighbouring samples of the density max(−dG/dt, 0) Ψ_β(−G) / β.
+
+    Where G falls monotonically from G₀ to G₁ this is exactly F(G₀/β) − F(G₁/β), with F of `laplace_depth`,
+    whatever the length of the interval; where G rises it is 0. Every ray is taken to come from far outside:
+    the depth −F(G₀/β) before its first sample counts for its first interval. So matter in front of a camera
+    is opaque, and a ray along which G falls to d and then rises has the depth −F(d/β) in total: e^{−d/β} / 2
+    outside, 1/2 on the surface, and 8 at 8 β inside.
+
+    Args:
+        sdf: signed distance at the samples, scene units.
+        beta: scale β > 0, scene units.
+
+    Returns:
+        Depths ≥ 0, in float32 or wider.
+
+    Example:
+        >>> sdf_along_ray = torch.tensor([10.0, 0.0, 10.0])  # the ray touches the surface
+        >>> entering_depth(sdf_along_ray, torch.tensor(0.1))
+        tensor([0.5000, 0.0000])
+    """
+    scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
+    depth = torch.relu(-_antiderivative_differences(scaled))
+    first = scaled[..., :1]
+    before = 0.5 * torch.exp(-first.abs()) + torch.relu(-first)
+    return torch.cat([before + depth[..., :1], depth[..., 1:]], dim=-1)
+
+
+def _antiderivative_differences(scaled: Float[Tensor, "*shape M"]) -> Float[Tensor, "*shape M-1"]:
+    """F(u₁) − F(u₀) of neighbouring u = sdf/β, with F(u) = min(u, 0) − ½ e^{−|u|}, F' = Ψ(−u)."""
+    outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
+    # The differences of both terms are taken separately: deep inside, the first term is large and would
+    # absorb the second.
+    return inside.diff(dim=-1) - 0.5 * torch.exp(inside - outside).diff(dim=-1)
+
+
 class LaplaceDensity(nn.Module):
     """The Laplace density with a learned scale β = |parameter| + floor (VolSDF).
 
     Args:
         beta_init: initial β, scene units.
         beta_floor: smallest β, scene units.
+        kind: "isotropic" (VolSDF), or "entering".
 
     Raises:
         UserError: the initial β is not above the floor, or the floor is not positive.
     """
 
-    def __init__(self, beta_init: float, beta_floor: float = BETA_FLOOR) -> None:
+    def __init__(
+        self,
+        beta_init: float,
+        beta_floor: float = BETA_FLOOR,
+        kind: Literal["isotropic", "entering"] = "isotropic",
+    ) -> None:
         super().__init__()
         if not 0.0 < beta_floor < beta_init:
             raise UserError(
@@ -102,7 +156,7 @@ class LaplaceDensity(nn.Module):
                 "must be above 0",
                 f"choose a host.volume.beta_init above {BETA_FLOOR}",
             )
-        self.beta_floor = beta_floor
+        self.kind, self.beta_floor = kind, beta_floor
         self.above_floor = nn.Parameter(torch.tensor(beta_init - beta_floor))
 
     def beta(self) -> Float[Tensor, ""]:
@@ -116,5 +170,11 @@ class LaplaceDensity(nn.Module):
         self.above_floor.clamp_(-largest, largest)
 
     def forward(self, sdf: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, "N M-1"]:
-        """Optical depth between the samples of rays, see `laplace_depth`."""
-        return laplace_depth(sdf, distances, self.beta())
+        """Optical depth between the samples of rays."""
+        return self.depth(sdf, distances, self.beta())
+
+    def depth(
+        self, sdf: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], beta: Float[Tensor, ""]
+    ) -> Float[Tensor, "N M-1"]:
+        """As `forward`, with a scale of its own."""
+        return entering_depth(sdf, beta) if self.kind == "entering" else laplace_depth(sdf, distances, beta)

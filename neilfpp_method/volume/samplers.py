@@ -144,11 +144,14 @@ class SampleCounts:
         cuts: SDF queries in the first round of the sampler and in each refinement round.
         rounds: maximum number of refinement rounds.
         rendered: samples that are rendered.
+        with_nearest: whether the cut with the smallest signed distance is one of them. The entering density
+            has its opacity from there (`volume.density`).
     """
 
     cuts: int
     rounds: int
     rendered: int
+    with_nearest: bool = False
 
     def of_narrowed_rays(self) -> SampleCounts:
         """The counts for rays of which only the part that is not empty is sampled: half as many cuts."""
@@ -157,9 +160,8 @@ class SampleCounts:
 
 def sample_counts(config: VolumeConfig) -> SampleCounts:
     """The counts that suit the settings, for whole rays."""
-    if config.skip_empty:
-        return SampleCounts(SKIPPING_CUTS, SKIPPING_ROUNDS, config.samples)
-    return SampleCounts(CUTS, ROUNDS, config.samples)
+    cuts, rounds = (SKIPPING_CUTS, SKIPPING_ROUNDS) if config.skip_empty else (CUTS, ROUNDS)
+    return SampleCounts(cuts, rounds, config.samples, with_nearest=config.density == "entering")
 
 
 @dataclass(frozen=True)
@@ -223,9 +225,7 @@ def error_bounded_samples(
         beta_plus = torch.where(converged, beta, beta_plus)
         if can_leave_early(near.device):
             done, left = converged[:, 0], ~converged[:, 0]
-            samples[rows[done]] = opacity_samples(
-                partition[done], beta_plus[done], counts.rendered, stochastic
-            )
+            samples[rows[done]] = opacity_samples(partition[done], beta_plus[done], counts, stochastic)
             rows, rays, partition, beta_plus = rows[left], rays[left], partition[left], beta_plus[left]
         beta_plus = bounded_beta(partition, beta, beta_plus)
         if rounds_left == 0 or len(rows) == 0:
@@ -234,7 +234,7 @@ def error_bounded_samples(
         partition = with_cuts(sdf, rays, partition, shares, counts.cuts, stochastic)
         queries += len(rows) * counts.cuts
 
-    samples[rows] = opacity_samples(partition, beta_plus, counts.rendered, stochastic)
+    samples[rows] = opacity_samples(partition, beta_plus, counts, stochastic)
     return ErrorBoundedSamples(samples, error_bound, queries / max(number, 1))
 
 
@@ -272,16 +272,20 @@ def query(sdf: SignedDistance, rays: RayBatch, distances: Float[Tensor, "N M"]) 
 
 
 def opacity_samples(
-    partition: Partition, beta: Float[Tensor, "N 1"], count: int, stochastic: bool
-) -> Float[Tensor, "N {count}"]:
+    partition: Partition, beta: Float[Tensor, "N 1"], counts: SampleCounts, stochastic: bool
+) -> Float[Tensor, "N {counts.rendered}"]:
     """Samples to render: both ends of each ray, and between them 2/3 by opacity and 1/3 spread over the cuts.
 
     Sampling by opacity inverts the partition's Ô, normalised to 1 at far (VolSDF Algorithm 1, last step).
+    `counts.with_nearest` replaces one of the samples in between by the cut with the smallest signed distance.
     """
     distances = partition.distances
     density = laplace_density(partition.sdf[:, :-1], beta)
     mass = render_weights(density, distances[:, :-1], distances[:, -1]).weights
     mass = mass / mass.sum(dim=-1, keepdim=True).clamp_min(torch.finfo(mass.dtype).tiny)
     mass = (1.0 - SPREAD_SHARE) * mass + SPREAD_SHARE / mass.shape[-1]
-    within = inverse_cdf_samples(distances, mass, count - 2, stochastic)
+    within = inverse_cdf_samples(distances, mass, counts.rendered - 2 - counts.with_nearest, stochastic)
+    if counts.with_nearest:
+        nearest = distances.gather(-1, partition.sdf.argmin(dim=-1, keepdim=True))
+        within = torch.cat([within, nearest], dim=-1).sort(dim=-1).values
     return torch.cat([distances[:, :1], within, distances[:, -1:]], dim=-1)

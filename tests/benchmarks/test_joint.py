@@ -26,7 +26,7 @@ def test_all_rays_meet_the_table():
 
 def test_a_field_is_fitted_to_the_table_and_copied_to_another_host(monkeypatch):
     monkeypatch.setattr(joint, "FIT_STEPS", 60)
-    config = changed(tiny_config(), {"host.loss.hessian_joint": 0.0})
+    config = changed(tiny_config(), {"host.loss.hessian": (1e-3, 1e-3, 0.0)})
     x = torch.rand(500, 3) * 1.6 - 0.8
     fitted = fitted_model(config)
     off = (fitted.host.sdf(x) - table(x)).abs().mean()

@@ -61,7 +61,7 @@ def small_config(light: str, mode: str = "off") -> NeilfConfig:
         {
             "loss": {"position_gradient": 1.0, "normal_gradient": 1.0},
             # L_Hess is computed about hits that count as constants, so its slope is not that of a difference.
-            "host.loss": {"hessian": 0.0, "hessian_joint": 0.0},
+            "host.loss": {"hessian": (0.0, 0.0, 0.0)},
             "shading.normals": "host",
             "light.inter_reflection": mode,
             "shading.hit_share": 0.3,

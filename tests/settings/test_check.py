@@ -40,8 +40,14 @@ WRONG = {
     "a negative weight of a loss of G": (
         preset("fast"),
         "host.loss",
-        {"hessian_joint": -1.0},
-        "--config.host.loss.hessian-joint is -1.0; set it to 0 or more",
+        {"eikonal": -1.0},
+        "--config.host.loss.eikonal is -1.0; set it to 0 or more",
+    ),
+    "a negative weight of one stage": (
+        preset("fast"),
+        "host.loss",
+        {"hessian": (1e-3, 1e-3, -1.0)},
+        r"--config.host.loss.hessian is \(0.001, 0.001, -1.0\); set it to numbers of 0 or more",
     ),
     "no incident directions": (
         preset("fast"),

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.stats import laplace
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.volume.density import LaplaceDensity, laplace_density, laplace_depth
+from neilfpp_method.volume.density import LaplaceDensity, entering_depth, laplace_density, laplace_depth
 
 
 @pytest.mark.parametrize("beta", [0.5, 0.1, 0.003])
@@ -79,6 +79,71 @@ def test_depth_has_gradients_also_along_a_surface():
     cuts = torch.tensor([[0.0, 0.2, 0.5, 0.7, 1.0, 1.4]], dtype=torch.float64)
     beta = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda s, b: laplace_depth(s, cuts, b), (sdf, beta))
+
+
+# ------------------------------------------------------------------------------------------- entering density
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize(
+    "ends", [(0.5, 0.2), (0.3, -0.4), (-0.1, -2.0), (1e-4, -1e-4), (40.0, -3.0), (-30.0, -31.0)]
+)
+def test_entering_depth_is_the_integral_of_the_density_where_the_distance_falls(ends, dtype):
+    beta = 0.1
+    fall = ends[0] - ends[1]
+    expected, _ = quad(
+        lambda t: fall * laplace.cdf(fall * t - ends[0], scale=beta) / beta,
+        0.0,
+        1.0,
+        points=[np.clip(ends[0] / fall, 0.0, 1.0)],
+        epsabs=0.0,
+        epsrel=1e-10,
+    )
+    found = entering_depth(torch.tensor([(50.0, *ends)], dtype=dtype), torch.tensor(beta))[0, 1]
+    assert found.item() == pytest.approx(expected, rel=1e-6 if dtype is torch.float64 else 2e-5)
+
+
+def test_entering_depth_is_zero_where_the_distance_rises():
+    rising = torch.tensor([50.0, -0.3, -0.3, 0.0, 2.0], dtype=torch.float64)
+    assert entering_depth(rising, torch.tensor(0.1, dtype=torch.float64)).tolist()[1:] == [0.0] * 3
+
+
+@pytest.mark.parametrize("start", [0.3, 0.0, -0.3])
+def test_a_ray_that_starts_near_or_in_a_surface_has_entered_it_before(start):
+    from_start, from_afar = torch.tensor([start, start + 0.1]), torch.tensor([50.0, start, start + 0.1])
+    beta = torch.tensor(0.1)
+    assert entering_depth(from_start, beta).sum().item() == pytest.approx(
+        entering_depth(from_afar, beta).sum().item()
+    )
+
+
+def test_the_depth_of_a_passing_ray_depends_on_its_smallest_distance_alone():
+    """A small and a large sphere, passed at the same distance; the isotropic density tells them apart."""
+    along = torch.linspace(-2.0, 2.0, 4001, dtype=torch.float64)
+    beta, gap = torch.tensor(0.02, dtype=torch.float64), 0.03
+    passed = torch.stack([(along.square() + (r + gap) ** 2).sqrt() - r for r in (0.1, 1.0)])
+    depth = entering_depth(passed, beta).sum(-1)
+    torch.testing.assert_close(depth, torch.full_like(depth, 0.5 * math.exp(-gap / beta.item())))
+    isotropic = laplace_depth(passed, along.expand(2, -1), beta).sum(-1)
+    assert isotropic[1] > 2.0 * isotropic[0] > 4.0 * depth[0]
+
+
+def test_entering_depth_has_gradients():
+    sdf = torch.tensor([[0.3, 0.1, -0.2, -0.21, 0.05, 0.01]], dtype=torch.float64, requires_grad=True)
+    beta = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(entering_depth, (sdf, beta))
+
+
+def test_the_kind_determines_the_depth():
+    sdf, cuts, beta = torch.tensor([[0.2, -0.1]]), torch.tensor([[1.0, 3.0]]), torch.tensor(0.05)
+    expected = {"isotropic": laplace_depth(sdf, cuts, beta), "entering": entering_depth(sdf, beta)}
+    for kind, depth in expected.items():
+        density = LaplaceDensity(0.05, kind=kind)
+        assert torch.equal(density.depth(sdf, cuts, beta), depth)
+        torch.testing.assert_close(density(sdf, cuts), depth)
+
+
+# ------------------------------------------------------------------------------------------------------ scale
 
 
 def test_beta_starts_at_the_given_value_and_stays_above_its_floor():

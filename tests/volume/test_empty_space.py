@@ -15,7 +15,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume import empty_space
 from neilfpp_method.volume.compositing import depth_weights
-from neilfpp_method.volume.density import laplace_density, laplace_depth
+from neilfpp_method.volume.density import entering_depth, laplace_density, laplace_depth
 from neilfpp_method.volume.distance_grid import cell_size
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import sphere_interval
@@ -97,6 +97,23 @@ def test_skipped_parts_have_no_weight(sdf, beta, inside):
 def test_no_thin_plate_is_lost(share, tilt, offset, log_beta, seed):
     """From a thousandth of a cell to two cells thick, at any position."""
     assert_nothing_lost(plate(share * CELL, tilt, offset), bundle(20, seed), 10.0**log_beta)
+
+
+@pytest.mark.parametrize("beta", [0.1, 0.02, 0.003])
+@pytest.mark.parametrize(
+    "sdf", [sphere_distance, hollow, plate(0.2), plate(0.05)], ids=["sphere", "hollow", "plate", "sheet"]
+)
+def test_what_is_hidden_has_hardly_any_weight_with_the_entering_density_either(sdf, beta):
+    rays = bundle(400)
+    whole, part = narrowed(sdf, rays, beta)
+    edges = torch.lerp(whole.near[:, None], whole.far[:, None], torch.linspace(0, 1, 8001))
+    points = rays.origins[:, None] + edges[..., None] * rays.directions[:, None]
+    depth = entering_depth(sdf(points.reshape(-1, 3)).view(edges.shape), torch.tensor(beta))
+    weight = depth_weights(depth).weights
+    middle = 0.5 * (edges[:, 1:] + edges[:, :-1])
+    lost = (weight * ((middle < part.near[:, None]) | (middle > part.far[:, None]))).sum(-1)
+    assert lost.max() < 2.0 * empty_space.MAX_OPACITY_IN_TRAINING
+    assert (lost > empty_space.MAX_OPACITY_IN_TRAINING).float().mean() < 0.005
 
 
 def test_grazing_rays_keep_the_surface_that_they_graze():
