@@ -136,4 +136,26 @@ LATER_FAULTS: Sequence[Mutant] = (
         "pass",
         "test_attach_health.py",
     ),
+    # The entering density.
+    Mutant(
+        "rays that leave matter become opaque, too",
+        "volume/density.py",
+        "torch.relu(-_antiderivative_differences(scaled))",
+        "_antiderivative_differences(scaled).abs()",
+        "volume/test_density.py",
+    ),
+    Mutant(
+        "matter in front of a camera is invisible",
+        "volume/density.py",
+        "torch.cat([before + depth[..., :1]",
+        "torch.cat([depth[..., :1]",
+        "volume/test_density.py",
+    ),
+    Mutant(
+        "the rendered cut is the most distant one",
+        "volume/samplers.py",
+        "partition.sdf.argmin(",
+        "partition.sdf.argmax(",
+        "volume/test_samplers.py",
+    ),
 )
