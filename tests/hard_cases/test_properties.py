@@ -33,7 +33,7 @@ from neilfpp_method.shading.color import linear_to_srgb, residual
 from neilfpp_method.stratified.intervals import inverse_cdf_samples
 from neilfpp_method.structures import Material
 from neilfpp_method.volume.compositing import depth_weights
-from neilfpp_method.volume.density import laplace_density, laplace_depth
+from neilfpp_method.volume.density import entering_depth, laplace_density, laplace_depth
 from tests.hard_cases.test_fields import gradients
 from tests.lighting.surfaces import material, points
 
@@ -234,6 +234,27 @@ def test_depth_is_finite_and_between_those_of_the_ends(dtype, distances, widths,
     most = torch.maximum(wide[:, 1:], wide[:, :-1]) * along.diff(dim=-1)
     assert (depth <= most * 1.01 + 1e-6).all()
     assert_finite(depth, *torch.autograd.grad(depth.sum(), [sdf, scale]), bound=1e12)
+
+
+@every_dtype
+@some_examples
+@given(
+    arrays(np.float64, (ROWS, 4), elements=st.floats(-100, 100, width=32)),
+    st.floats(1e-4, 1.0),
+)
+def test_entering_depth_is_finite_and_at_least_that_of_the_smallest_distance(dtype, distances, beta):
+    sdf = torch.from_numpy(distances).to(dtype).requires_grad_()
+    scale = torch.tensor(beta, dtype=torch.promote_types(dtype, torch.float32)).requires_grad_()
+    depth = entering_depth(sdf, scale)
+    assert depth.dtype == torch.promote_types(dtype, torch.float32)
+    assert depth.min() >= 0
+    total = depth.detach().double().sum(-1)
+    smallest = sdf.detach().double().amin(-1) / scale.detach().double()
+    of_smallest = 0.5 * torch.exp(-smallest.abs()) + torch.relu(-smallest)
+    assert (total >= of_smallest * (1 - 1e-4) - torch.finfo(torch.float32).tiny).all()
+    slope, by_scale = torch.autograd.grad(depth.sum(), [sdf, scale])
+    assert_finite(slope, bound=2.01 / scale.item())
+    assert_finite(by_scale, bound=1e12)
 
 
 # -------------------------------------------------------------------------------------------------- encodings
