@@ -137,7 +137,7 @@ BETA_STUCK = Case(
     name="beta_stuck",
     severe=True,
     cause="a width β that is only learned, and photographs that fog explains well enough",
-    remedy="bound it (host.volume.beta_final to 0.004), raise its learning rate (optimizer.beta), or start "
+    remedy="bound it (host.volume.beta_final to 0.002), raise its learning rate (optimizer.beta), or start "
     "lower (host.volume.beta_init)",
 )
 OFF_CLOUD = Case(

@@ -129,7 +129,7 @@ FAST: Mapping[str, Any] = {
     "background.radius": 1.75,
     "host.volume.density": "entering",
     "host.volume.beta_init": 0.05,
-    "host.volume.beta_final": 0.004,
+    "host.volume.beta_final": 0.002,
     "host.volume.skip_empty": True,
     "host.volume.samples": 32,
     "shading.lobe": "ggx",

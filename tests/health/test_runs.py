@@ -52,7 +52,7 @@ def sdf_init(capture: Path, out: Path, **changes: object):
 def test_a_surface_that_stays_soft_is_reported_once_at_half_of_sdf_init(capture, tmp_path):
     run, warned, said = sdf_init(capture, tmp_path, **SOFT)
     assert [line[:8] for line in warned] == [f"step {SURFACE_FROM * 60:.0f}:"]
-    assert "host.volume.beta_final to 0.004" in warned[0]
+    assert "host.volume.beta_final to 0.002" in warned[0]
     assert said == []
     (finding,) = run.watch.findings.values()
     assert (finding.case, finding.step) == ("beta_stuck", 30)
@@ -63,7 +63,7 @@ def test_a_surface_that_stays_soft_is_reported_once_at_half_of_sdf_init(capture,
 
 
 def test_the_remedy_of_a_soft_surface_helps(capture, tmp_path):
-    run, warned, _ = sdf_init(capture, tmp_path, **(SOFT | {"host.volume.beta_final": 0.004}))
+    run, warned, _ = sdf_init(capture, tmp_path, **(SOFT | {"host.volume.beta_final": 0.002}))
     assert warned == []
     assert run.watch.health.verdict == "sound"
 
