@@ -22,6 +22,8 @@ COUNTS = ("train.rays", "train.checkpoint_every", "shading.train_samples", "shad
 """Settings that are at least 1."""
 INITIAL_VALUES = ("brdf.initial_base_color", "brdf.initial_metallic")
 """Settings between 0 and 1, without these bounds: the sigmoid of the field does not reach them."""
+MIN_SAMPLES = 4
+"""Smallest number of rendered samples per ray: both ends, the cut nearest to a surface, one by opacity."""
 MAX_SEED = 2**32 - 1
 """Largest seed. The seed of a step is a multiple of it (`seed_step`) that must fit into 64 bits."""
 
@@ -58,7 +60,7 @@ def _check_ranges(config: NeilfConfig) -> None:
 
 def _check_recovered_geometry(config: NeilfConfig) -> None:
     """The settings that only a host with a distance field has."""
-    _require(lambda count: count >= 1, config, "host.volume.samples", "1 or more")
+    _require(lambda count: count >= MIN_SAMPLES, config, "host.volume.samples", f"{MIN_SAMPLES} or more")
     _require(_is_positive, config, "host.volume.beta_init", "a number above 0")
     _require(lambda bound: not bound < 0, config, "host.volume.beta_final", "0 (no bound) or more")
     _check_not_negative(config, "host.loss")

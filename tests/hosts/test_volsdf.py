@@ -12,6 +12,7 @@ from torch.nn.functional import normalize
 from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.hosts.base import HasParameterGroups, HasSurfaceWidth, Host, Regularized
 from neilfpp_method.hosts.volsdf import VolSdfHost
+from neilfpp_method.settings.check import MIN_SAMPLES
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import preset
@@ -119,6 +120,15 @@ def test_the_opacity_of_rays_that_graze_a_sphere_is_accurate(name, beta, error, 
     assert (
         depth.abs().max() < 3.0 * (2.0 * RADIUS * beta) ** 0.5
     )  # as far as the layer reaches along such a ray
+
+
+@pytest.mark.parametrize("density", ["isotropic", "entering"])
+def test_the_smallest_number_of_samples_renders(density):
+    config = changed(tiny_config(), {"host.volume.samples": MIN_SAMPLES, "host.volume.density": density})
+    host = sphere_model(config).host
+    hits = host.render_regularized(sphere_batch(8), ["volume", "mask"]).hits
+    assert hits.color.isfinite().all()
+    assert hits.position.isfinite().all()
 
 
 def test_only_the_named_losses_are_computed(sharp):

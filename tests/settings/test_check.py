@@ -36,7 +36,12 @@ WRONG = {
         {"beta_init": 0.0},
         "host.volume.beta-init is 0.0; set it to a number above 0",
     ),
-    "no samples": (preset("fast"), "host.volume", {"samples": 0}, "host.volume.samples is 0; set it to 1"),
+    "too few samples": (
+        preset("fast"),
+        "host.volume",
+        {"samples": 3},
+        "host.volume.samples is 3; set it to 4 or more",
+    ),
     "a negative weight of a loss of G": (
         preset("fast"),
         "host.loss",
