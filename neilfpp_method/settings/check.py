@@ -38,12 +38,6 @@ def check_config(config: NeilfConfig) -> None:
     _check_ranges(config)
     if isinstance(config.host, VolSdfConfig):
         _check_recovered_geometry(config)
-    rates = config.optimizer
-    if min(rates.final) <= 0 or min(rates.drops) < 0 or rates.warm_up < 0:
-        raise UserError(
-            f"--config.optimizer.final {rates.final}, drops {rates.drops}, warm-up {rates.warm_up}",
-            "set every value of final above 0, and the others to 0 or more",
-        )
 
 
 def _check_ranges(config: NeilfConfig) -> None:
@@ -56,6 +50,7 @@ def _check_ranges(config: NeilfConfig) -> None:
     _require(_is_positive, config, "background.radius", "a number above 0")
     for group in ("loss", "optimizer"):
         _check_not_negative(config, group)
+    _require(lambda final: min(final) > 0, config, "optimizer.final", "numbers above 0")
 
 
 def _check_recovered_geometry(config: NeilfConfig) -> None:

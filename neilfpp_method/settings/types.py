@@ -194,7 +194,7 @@ class VolumeConfig:
 
     density: Literal["isotropic", "entering"] = "isotropic"
     """isotropic: the density of VolSDF. entering: a density only where G falls along the ray, which does not
-    make rays opaque that pass a surface at a distance of a few β.
+    make rays opaque that pass a surface at a distance of a few β. It needs a small `beta_init` (0.05).
     """
     beta_init: float = 0.1
     """Initial scale β of the Laplace density."""

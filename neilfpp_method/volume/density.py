@@ -9,6 +9,9 @@ a few β.
 The entering density acts only where the signed distance falls along the ray. The opacity of a ray then
 depends on its smallest distance alone, from whichever direction it comes. It is the density of NeuS (Wang et
 al. 2021) with the Laplace instead of the logistic distribution.
+
+It needs a β well below the size of the objects, because a ray becomes opaque only several β inside. With β =
+0.3 a ball of radius 0.8 grew to the whole scene; with the 0.05 of `fast` it kept its size.
 """
 
 from __future__ import annotations

@@ -5,7 +5,8 @@ each interval, and adds cuts where they lower that bound most. No gradient flows
 
 The rendered samples are of two kinds (published code): most are distributed by opacity, and the rest, with
 both ends of the ray, is spread over the whole ray, so that the density is also sampled where it is low.
-Without the latter a ray that grazes a surface would be rendered too opaque.
+Without the latter a ray that grazes a surface would be rendered too opaque. With the entering density
+(`volume.density`) the cut nearest to the surface is rendered as well.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def test_the_remedy_of_a_soft_surface_helps(capture, tmp_path):
 
 def test_a_surface_that_becomes_sharp_late_is_reported_and_then_said_to_have_recovered(capture, tmp_path):
     """The bound of β is 0.04 after half of SDF init, 0.02 after two thirds, and 0.005 at its end."""
-    # With the entering density and so wide a layer, the surface would also leave the point cloud.
+    # The entering density needs a thinner layer: here the ball would grow beyond its point cloud.
     late = {
         "host.volume.density": "isotropic",
         "host.volume.beta_init": 0.3,

@@ -54,6 +54,18 @@ WRONG = {
         {"hessian": (1e-3, 1e-3, -1.0)},
         r"--config.host.loss.hessian is \(0.001, 0.001, -1.0\); set it to numbers of 0 or more",
     ),
+    "a learning rate that falls to 0": (
+        preset("fast"),
+        "optimizer",
+        {"final": (0.1, 0.0, 0.1)},
+        r"optimizer.final is \(0.1, 0.0, 0.1\); set it to numbers above 0",
+    ),
+    "a negative number of drops": (
+        preset("fast"),
+        "optimizer",
+        {"drops": (0, -1, 0)},
+        r"optimizer.drops is \(0, -1, 0\); set it to numbers of 0 or more",
+    ),
     "no incident directions": (
         preset("fast"),
         "shading",
