@@ -50,7 +50,7 @@ $(NERFSTUDIO)/.installed: pyproject.toml $(NERFSTUDIO_PINS)
 	touch $@
 
 test-nerfstudio: $(NERFSTUDIO)/.installed
-	OMP_NUM_THREADS=1 $(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow"
+	OMP_NUM_THREADS=1 $(NERFSTUDIO)/bin/python -m pytest tests_nerfstudio -m "not slow" -n 2 --dist loadscope
 
 # Builds the wheel and the source distribution, and runs the command of the wheel in an empty environment.
 package:
