@@ -68,7 +68,7 @@ class Options:
     """The test views under another light: envmap.exr and images/."""
     runs: tuple[Path, ...] = ()
     """Runs on this capture."""
-    lobe: Literal["spherical_gaussian", "ggx"] = "spherical_gaussian"
+    lobe: Literal["spherical_gaussian", "ggx", "ggx_burley"] = "spherical_gaussian"
     """Specular lobe with which the true images were rendered, for the true material."""
     exchange: bool = False
     """Also measure each run with the true base colour, and with the true roughness and metallic."""

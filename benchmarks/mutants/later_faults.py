@@ -158,4 +158,11 @@ LATER_FAULTS: Sequence[Mutant] = (
         "partition.sdf.argmax(",
         "volume/test_samplers.py",
     ),
+    Mutant(
+        "hits are the mean of the samples, inside the surface",
+        "volume/compositing.py",
+        "depth = mean + inside",
+        "depth = mean + 0.0 * inside",
+        "volume/test_compositing.py",
+    ),
 )

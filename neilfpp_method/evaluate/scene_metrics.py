@@ -11,9 +11,9 @@ from neilfpp_method.data.mesh import Mesh
 from neilfpp_method.data.truth import LightField
 from neilfpp_method.evaluate import metrics
 from neilfpp_method.export.extract import extract_mesh
-from neilfpp_method.hosts.volsdf import HIT_RADIUS
 from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.train.run import Run
+from neilfpp_method.volume.compositing import HIT_RADIUS
 
 __all__ = ["chamfer_metrics", "light_metrics"]
 

@@ -24,9 +24,10 @@ from neilfpp_method.data.files.number_arrays import arrays_of_archive
 from neilfpp_method.errors import UserError
 from neilfpp_method.export.extract import extract_mesh
 from neilfpp_method.hosts.base import HasSdf
-from neilfpp_method.hosts.volsdf import HIT_RADIUS, VolSdfHost
+from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.train.run import Run
+from neilfpp_method.volume.compositing import HIT_RADIUS
 
 __all__ = [
     "ExtractedSurface",

@@ -16,13 +16,22 @@ from neilfpp_method.hosts.base import RegularizedHits
 from neilfpp_method.hosts.camera_places import check_cameras
 from neilfpp_method.hosts.patches import PatchViews, patch_loss
 from neilfpp_method.hosts.radiance import background_field, radiance_field
+from neilfpp_method.hosts.regularizer_points import SURFACE_WIDTH, regularizer_inputs
 from neilfpp_method.hosts.smooth_normals import smooth_normals
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.timing.ledger import timed
-from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights, share_near
+from neilfpp_method.volume.compositing import (
+    HIT_RADIUS,
+    Weights,
+    composite,
+    depth_weights,
+    sample_weights,
+    share_near,
+    surface_depth,
+)
 from neilfpp_method.volume.density import LaplaceDensity
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace
@@ -32,22 +41,10 @@ from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples, 
 
 __all__ = ["VolSdfHost"]
 
-POINTS_ABOUT_OBJECT = 2
-"""Points for regularisers per ray in the cube around the object, besides one per ray in the cube around the
-scene (published code: 8192 and 4096 points).
-"""
-HIT_RADIUS = 0.05
-"""The concentration of a hit is the rendering weight within this distance of it, scene units (METHOD §2)."""
-SURFACE_WIDTH = {"scene": 10.0, "rays": 0.05}
-"""Width ε of the smoothed delta of L_surf by `host.loss.points`, scene units; that of "scene" is the
-published value.
-"""
 NORMAL_RADIUS = 0.08
 """Radius within which normals are smoothed for shading, scene units."""
 GRID_LIFE = 100
 """Training steps of the geometry after which the distance grid is sampled again."""
-SPARE_WEIGHT = 1e-6
-"""Weight added to the last sample in the mean depth of a ray, so that it exists for an empty ray."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +54,6 @@ class March:
     distances: Float[Tensor, "N M"]
     surface: SdfSample
     hits: SurfaceHits
-
-
-@dataclass(frozen=True)
-class RegularizerInputs:
-    """Inputs of the regularisers: ∇G for L_Eik, G for L_surf, and points for L_Hess."""
-
-    gradient: Float[Tensor, "A 3"]
-    distance: Float[Tensor, " B"]
-    hessian_points: Float[Tensor, "C 3"]
 
 
 class VolSdfHost(nn.Module):
@@ -79,7 +67,6 @@ class VolSdfHost(nn.Module):
             Checkpoints contain them, because fields have no meaning in another scene frame.
 
     Attributes:
-        starts_from_shape: whether G has been fitted to a known shape (`train.start`); in checkpoints.
         patch_views: the images whose patches L_patch compares; None without this loss.
     """
 
@@ -92,7 +79,6 @@ class VolSdfHost(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
-        self.starts_from_shape = False
         self.patch_views: PatchViews | None = None
         self.radiance_scale = facts.radiance_scale
         self.background_kind = facts.background
@@ -103,14 +89,14 @@ class VolSdfHost(nn.Module):
         sdf, volume = config.host.sdf, config.host.volume
         self.sdf_field = SdfField(sdf, config.encoding, radius)
         self.radiance_field = radiance_field(config, facts, sdf.feature_width)
-        self.density = LaplaceDensity(volume.beta_init, kind=volume.density)
+        self.density = LaplaceDensity(volume.beta_init)
+        self.starts_from_shape = False
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
         self.cameras = cameras
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if volume.skip_empty else None
-        self.sample_counts = sample_counts(volume)
         hard = config.light.inter_reflection == "hard"
         resolution = GRID_RESOLUTION if hard else 0
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
@@ -120,6 +106,20 @@ class VolSdfHost(nn.Module):
         self._evaluation_space: EvaluationSpace | None = None
 
     # -------------------------------------------------------------------------------------- the host contract
+
+    @property
+    def starts_from_shape(self) -> bool:
+        """Whether G has been fitted to a known shape (`train.start`); in checkpoints. It decides on the
+        density "auto".
+        """
+        return self._starts_from_shape
+
+    @starts_from_shape.setter
+    def starts_from_shape(self, starts: bool) -> None:
+        self._starts_from_shape, volume = starts, self.config.host.volume
+        automatic = "entering" if starts else "isotropic"
+        self.density.kind = automatic if volume.density == "auto" else volume.density
+        self.sample_counts = sample_counts(volume, self.density.kind == "entering")
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
@@ -297,7 +297,7 @@ class VolSdfHost(nn.Module):
             wo = (-rays.directions)[:, None].expand_as(points).reshape(-1, 3)
             radiance = self.radiance_field(points.reshape(-1, 3), wo, normals, surface.feature)
             radiance = radiance.view_as(points)
-        hits = self._blend(rays, distances, weights, normals.view_as(points), radiance)
+        hits = self._blend(rays, distances, weights, surface, normals.view_as(points), radiance)
         return March(distances, surface, hits)
 
     def _sample(self, rays: RayBatch, interval: Interval, counts: SampleCounts) -> Float[Tensor, "N M"]:
@@ -309,13 +309,13 @@ class VolSdfHost(nn.Module):
         rays: RayBatch,
         distances: Float[Tensor, "N M"],
         intervals: Weights,
+        surface: SdfSample,
         normals: Float[Tensor, "N M 3"],
         radiance: Float[Tensor, "N M 3"] | None,
     ) -> SurfaceHits:
-        weights, opacity = sample_weights(intervals.weights), intervals.opacity
-        # The position of a ray without weight is its last sample: finite, and far from every surface.
-        depth = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
-        depth = depth / (opacity + SPARE_WEIGHT)
+        weights = sample_weights(intervals.weights)
+        slope = (surface.gradient.view_as(normals) * rays.directions[:, None]).sum(-1)
+        depth = surface_depth(weights, distances, surface.distance.view_as(weights), slope)
         color = torch.zeros_like(rays.origins)
         if radiance is not None:
             color = composite(weights, radiance)
@@ -324,7 +324,7 @@ class VolSdfHost(nn.Module):
             color=color,
             position=rays.origins + depth[:, None] * rays.directions,
             normal=safe_normalize(composite(weights, normals)),
-            opacity=opacity,
+            opacity=intervals.opacity,
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
 
@@ -347,7 +347,10 @@ class VolSdfHost(nn.Module):
     @timed("regularizers")
     def _regularizers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
-        inputs = self._regularizer_inputs(march) if {"eikonal", "surface", "hessian"} & set(names) else None
+        if {"eikonal", "surface", "hessian"} & set(names):
+            inputs = regularizer_inputs(
+                self.config.host.loss.points, march.surface, march.hits.position, self.sdf_field, self.radius
+            )
         if "eikonal" in names:
             terms["eikonal"] = losses.eikonal(inputs.gradient)
         if "surface" in names:
@@ -371,21 +374,3 @@ class VolSdfHost(nn.Module):
         beta, distance = self.density.beta().detach(), march.surface.distance.view_as(march.distances)
         depth = self.density.depth(distance, march.distances, beta).sum(-1)
         return losses.mask(depth, batch.mask, batch.mask_known, beta)
-
-    def _regularizer_inputs(self, march: March) -> RegularizerInputs:
-        """Inputs of the regularisers of G, at the points that `host.loss.points` names."""
-        position = march.hits.position.detach()
-        if self.config.host.loss.points == "rays":
-            near_surface = position + HIT_RADIUS * torch.randn_like(position)
-            return RegularizerInputs(march.surface.gradient, march.surface.distance, near_surface)
-        about_object = torch.empty_like(position).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
-        anywhere = torch.empty_like(position).uniform_(-1.0, 1.0) * self.radius
-        points = torch.cat((about_object, anywhere))
-        sample = self.sdf_field.with_gradient(points)
-        rays, count = march.distances.shape
-        one_of_ray = torch.arange(rays, device=points.device) * count + torch.randint(
-            count, (rays,), device=points.device
-        )
-        return RegularizerInputs(
-            torch.cat((sample.gradient, march.surface.gradient[one_of_ray])), sample.distance, points
-        )

@@ -192,9 +192,9 @@ class BackgroundConfig:
 class VolumeConfig:
     """Volume rendering of G (METHOD §3)."""
 
-    density: Literal["isotropic", "entering"] = "isotropic"
-    """isotropic: the density of VolSDF. entering: a density only where G falls along the ray, which does not
-    make rays opaque that pass a surface at a distance of a few β. It needs a small `beta_init` (0.05).
+    density: Literal["auto", "isotropic", "entering"] = "isotropic"
+    """isotropic: that of VolSDF. entering: only where G falls along the ray, so rays that pass a surface by a
+    few β are not opaque; needs a small `beta_init` (0.05). auto: entering if G starts as a hull.
     """
     beta_init: float = 0.1
     """Initial scale β of the Laplace density."""

@@ -140,7 +140,7 @@ class LaplaceDensity(nn.Module):
     Args:
         beta_init: initial β, scene units.
         beta_floor: smallest β, scene units.
-        kind: "isotropic" (VolSDF), or "entering".
+        kind: "isotropic" (VolSDF), or "entering"; may be changed between steps.
 
     Raises:
         UserError: the initial β is not above the floor, or the floor is not positive.

@@ -159,10 +159,10 @@ class SampleCounts:
         return replace(self, cuts=self.cuts // 2)
 
 
-def sample_counts(config: VolumeConfig) -> SampleCounts:
-    """The counts that suit the settings, for whole rays."""
+def sample_counts(config: VolumeConfig, with_nearest: bool = False) -> SampleCounts:
+    """The counts that suit the settings, for whole rays; for `with_nearest` see `SampleCounts`."""
     cuts, rounds = (SKIPPING_CUTS, SKIPPING_ROUNDS) if config.skip_empty else (CUTS, ROUNDS)
-    return SampleCounts(cuts, rounds, config.samples, with_nearest=config.density == "entering")
+    return SampleCounts(cuts, rounds, config.samples, with_nearest)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,13 @@ from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import HashGridConfig, NeilfConfig
 from neilfpp_method.structures import OrientedPoints, PixelBatch
-from neilfpp_method.train.optimizer import gradient_norms, make_optimizer, seed_step, set_rates
+from neilfpp_method.train.optimizer import (
+    gradient_norms,
+    limit_surface_width,
+    make_optimizer,
+    seed_step,
+    set_rates,
+)
 from tests.data.make_capture import srgb
 from tests.hard_cases.known_shapes import SHAPES, Seen, photograph
 from tests.hard_cases.shape_errors import Errors, Look, compare, rays_on_part
@@ -135,7 +141,7 @@ def learn(
 
 
 class Alone:
-    """The stage SDF init of a model, with the rates of the package's loop."""
+    """The stage SDF init of a model, with the rates and the bound of β of the package's loop."""
 
     def __init__(self, model: NeilfModel, steps: int) -> None:
         self.model, self.steps = model, steps
@@ -145,6 +151,7 @@ class Alone:
     def loss(self, batch: PixelBatch, step: int) -> torch.Tensor:
         config, at = self.model.config, StagePosition(Stage.SDF_INIT, step, self.steps)
         set_rates(self.optimizer, config.optimizer, at)
+        limit_surface_width(self.model.host, config, at)
         terms = self.model.step(batch, Stage.SDF_INIT).terms
         return weigh(terms, active_losses(Stage.SDF_INIT, config, self.model.stages, at.share)).loss
 

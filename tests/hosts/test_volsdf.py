@@ -54,6 +54,16 @@ def test_hits_lie_on_the_zero_set_with_its_normals(sharp):
     torch.testing.assert_close(hits.normal.norm(dim=-1), torch.ones(48))
 
 
+def test_hits_lie_much_closer_to_the_zero_set_than_the_layer_is_wide():
+    beta, density = 4e-3, "entering"
+    config = changed(tiny_config(), {"host.volume": {"beta_init": beta, "samples": 64, "density": density}})
+    host, rays = sphere_model(config).eval().host, sphere_batch(2000).rays
+    hits = host.render(rays)
+    off = host.sdf(hits.position[hits.is_hit(0.8)]).abs()
+    assert len(off) > 500
+    assert off.quantile(0.9) < 0.15 * beta  # the mean depth of such rays is 0.4 β inside
+
+
 def test_a_miss_has_the_background_color(sharp):
     sharp.background_color.fill_(0.25)
     misses = RayBatch(torch.tensor([[0.0, 0.0, -3.0], [0.0, 9.0, -3.0]]), torch.tensor([[0.0, 1.0, 0.0]] * 2))
@@ -120,6 +130,21 @@ def test_the_opacity_of_rays_that_graze_a_sphere_is_accurate(name, beta, error, 
     assert (
         depth.abs().max() < 3.0 * (2.0 * RADIUS * beta) ** 0.5
     )  # as far as the layer reaches along such a ray
+
+
+def test_the_automatic_density_acts_at_entry_if_geometry_starts_as_a_shape():
+    """From a ball, the isotropic density finds bowls and thin shapes that the entering one misses."""
+    host = sphere_model(changed(tiny_config(), {"host.volume.density": "auto"})).host
+    assert (host.density.kind, host.sample_counts.with_nearest) == ("isotropic", False)
+    host.starts_from_shape = True
+    assert (host.density.kind, host.sample_counts.with_nearest) == ("entering", True)
+    resumed = sphere_model(changed(tiny_config(), {"host.volume.density": "auto"})).host
+    resumed.load_state_dict(host.state_dict())
+    assert resumed.density.kind == "entering"
+    for kind in ("isotropic", "entering"):
+        named = sphere_model(changed(tiny_config(), {"host.volume.density": kind})).host
+        named.starts_from_shape = True
+        assert named.density.kind == kind
 
 
 @pytest.mark.parametrize("density", ["isotropic", "entering"])
