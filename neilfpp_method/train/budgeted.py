@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from neilfpp_method.budget.durations import format_duration
+from neilfpp_method.budget.expected import described
 from neilfpp_method.budget.plan import MIN_SHARE, share_for, smallest_budget, steps_for
 from neilfpp_method.budget.sizes import Size, next_size, sized
 from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES
@@ -136,13 +137,15 @@ def planned_effects(plan: BudgetPlan, effects: Plan) -> None:
         effects.decisions.append(Decision(0, LONG_TAILS, effects.is_on(LONG_TAILS), "settings", reason))
 
 
-def plan_summary(plan: BudgetPlan) -> str:
-    """One line for the console, before the training."""
+def plan_summary(plan: BudgetPlan, finds_geometry: bool) -> str:
+    """One line for the console, before the training: the planned steps, and what accuracy to expect."""
+    share = sum(plan.steps.values()) / sum(cost.steps for cost in plan.costs.stages.values())
     steps = ", ".join(f"{stage.replace('_', ' ')} {count}" for stage, count in plan.steps.items())
+    accuracy = "the accuracy of short trainings with a given mesh was not measured"
     return (
         f"budget {format_duration(plan.budget)}: planned steps: {steps}; step size: {plan.size}; "
-        f"{format_duration(plan.costs.once)} for measurements, previews and the report. The accuracy of the "
-        "result cannot be predicted"
+        f"{format_duration(plan.costs.once)} for measurements, previews and the report; "
+        f"{described(share) if finds_geometry else accuracy}"
     )
 
 

@@ -132,7 +132,8 @@ def plan_run(
         duration = format_duration(request.budget)
         console.print(f"budget {duration}: measuring a few steps of each stage", soft_wrap=True)
         budget = plan_budget(request.budget, work, ledger)
-        console.print(plan_summary(budget))
+        finds_geometry = settings.host.kind == "volsdf"
+        console.print(plan_summary(budget, finds_geometry), soft_wrap=True)
         settings = planned_settings(budget, settings)
     plan = Plan.begin(wanted, settings)
     if budget is not None:

@@ -86,6 +86,7 @@ def test_a_run_keeps_its_budget_although_steps_are_slower_than_in_the_trial(tmp_
     assert loaded.has_material
     assert "budget 2m: measuring a few steps of each stage" in said
     assert "budget 2m: planned steps: sdf init" in said
+    assert "expected accuracy" in said
     assert f"budget: {plan.took:.1f} s of 120 s" in said
 
     # The trial found no time for evidence for metals, so there may be metals.
