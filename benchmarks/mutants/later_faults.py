@@ -165,4 +165,11 @@ LATER_FAULTS: Sequence[Mutant] = (
         "depth = mean + 0.0 * inside",
         "volume/test_compositing.py",
     ),
+    Mutant(
+        "the automatic density acts at entry although geometry starts as a ball",
+        "hosts/volsdf.py",
+        'automatic = "entering" if starts else "isotropic"',
+        'automatic = "entering"',
+        "hosts/test_volsdf.py",
+    ),
 )

@@ -222,7 +222,7 @@ class Case:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
-LONGER = {"config": with_weak_masks(), "steps": 800}
+LONGER = {"config": with_weak_masks(), "steps": 1200}
 CASES = {
     "two touching balls": Case("two touching balls", Errors(0.05, 6.5, 0.01, 0.008)),
     "thin plate": Case(
