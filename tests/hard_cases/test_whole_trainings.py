@@ -185,7 +185,7 @@ CASES = {
             "normal": 20.0,
             "position": 0.048,
             "scaled_base_color": 0.18,
-            "roughness": 0.1,
+            "roughness": 0.22,
             "metallic": 0.24,
             "image": 0.33,
             "radiance": 0.3,
