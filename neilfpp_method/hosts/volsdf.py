@@ -150,8 +150,11 @@ class VolSdfHost(nn.Module):
         return self.density.beta().detach()
 
     def limit_surface_width(self, width: float) -> None:
-        """Lower β to `width` if it is larger."""
-        self.density.limit_(width)
+        """Lower β to `width` if it is larger; to half of it if "auto" has chosen the isotropic density, with
+        which surfaces lie the deeper, the wider the layer is.
+        """
+        is_automatic = self.config.host.volume.density == "auto"
+        self.density.limit_(0.5 * width if is_automatic and self.density.kind == "isotropic" else width)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field."""

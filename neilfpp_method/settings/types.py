@@ -199,7 +199,9 @@ class VolumeConfig:
     beta_init: float = 0.1
     """Initial scale β of the Laplace density."""
     beta_final: float = 0.0
-    """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound."""
+    """Upper bound of β from the end of SDF init on; until then it falls from `beta_init`. 0: no bound. Half
+    of it applies where the density "auto" is isotropic.
+    """
     skip_empty: bool = False
     """Whether rays skip parts that a coarse grid of the SDF shows to be empty, in training and evaluation.
     The sampler then queries the SDF less often, as the rest of a ray is short.

@@ -136,8 +136,12 @@ def test_the_automatic_density_acts_at_entry_if_geometry_starts_as_a_shape():
     """From a ball, the isotropic density finds bowls and thin shapes that the entering one misses."""
     host = sphere_model(changed(tiny_config(), {"host.volume.density": "auto"})).host
     assert (host.density.kind, host.sample_counts.with_nearest) == ("isotropic", False)
+    host.limit_surface_width(0.01)
+    assert host.surface_width().item() == pytest.approx(0.005)
     host.starts_from_shape = True
     assert (host.density.kind, host.sample_counts.with_nearest) == ("entering", True)
+    host.limit_surface_width(4e-3)
+    assert host.surface_width().item() == pytest.approx(4e-3)
     resumed = sphere_model(changed(tiny_config(), {"host.volume.density": "auto"})).host
     resumed.load_state_dict(host.state_dict())
     assert resumed.density.kind == "entering"
