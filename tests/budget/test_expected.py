@@ -47,5 +47,5 @@ def test_the_loss_falls_with_the_share():
 def test_the_description_names_what_was_measured():
     text = described(0.3)
     assert "30% of the steps" in text
-    assert "base colour 3.2, roughness 1.9 and metallic 3.7 dB, normals 0.9° worse" in text
+    assert "base colour 3.2, roughness 1.9 and metallic 3.7 dB, normals 1.0° worse" in text
     assert described(2.0) == "expected accuracy: that of all steps of the settings"
