@@ -168,8 +168,8 @@ LATER_FAULTS: Sequence[Mutant] = (
     Mutant(
         "the automatic density acts at entry although geometry starts as a ball",
         "hosts/volsdf.py",
-        'automatic = "entering" if starts else "isotropic"',
-        'automatic = "entering"',
+        'return "entering" if self.starts_from_shape else "isotropic"',
+        'return "entering"',
         "hosts/test_volsdf.py",
     ),
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.fields.sdf import SdfField, SdfSample
+from neilfpp_method.fields.sdf import SdfSample
 from neilfpp_method.volume.compositing import HIT_RADIUS
 
 __all__ = ["SURFACE_WIDTH", "RegularizerInputs", "regularizer_inputs"]
@@ -37,7 +38,7 @@ def regularizer_inputs(
     points: Literal["scene", "rays"],
     samples: SdfSample,
     hits: Float[Tensor, "N 3"],
-    field: SdfField,
+    field: Callable[[Float[Tensor, "P 3"]], SdfSample],
     radius: float,
 ) -> RegularizerInputs:
     """Inputs of the regularisers in a step.
@@ -47,7 +48,7 @@ def regularizer_inputs(
             "scene": random points of the scene, with one sample of each ray for L_Eik.
         samples: G at the samples of the rays, ray by ray.
         hits: positions of the hits of the rays, scene frame.
-        field: G, queried at the random points.
+        field: G with its gradient, queried at the random points.
         radius: radius of the scene sphere, scene units.
     """
     hits = hits.detach()
@@ -57,7 +58,7 @@ def regularizer_inputs(
     about_object = torch.empty_like(hits).repeat(POINTS_ABOUT_OBJECT, 1).uniform_(-1.0, 1.0)
     anywhere = torch.empty_like(hits).uniform_(-1.0, 1.0) * radius
     drawn = torch.cat((about_object, anywhere))
-    at_points = field.with_gradient(drawn)
+    at_points = field(drawn)
     rays, per_ray = len(hits), len(samples.distance) // len(hits)
     of_ray = torch.arange(rays, device=hits.device) * per_ray
     of_ray = of_ray + torch.randint(per_ray, (rays,), device=hits.device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -32,7 +32,7 @@ from neilfpp_method.volume.compositing import (
     share_near,
     surface_depth,
 )
-from neilfpp_method.volume.density import LaplaceDensity
+from neilfpp_method.volume.density import DensityKind, LaplaceDensity, optical_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
@@ -67,6 +67,7 @@ class VolSdfHost(nn.Module):
             Checkpoints contain them, because fields have no meaning in another scene frame.
 
     Attributes:
+        starts_from_shape: whether G has been fitted to a known shape (`train.start`); in checkpoints.
         patch_views: the images whose patches L_patch compares; None without this loss.
     """
 
@@ -79,6 +80,7 @@ class VolSdfHost(nn.Module):
     ) -> None:
         super().__init__()
         self.config = config
+        self.starts_from_shape = False
         self.patch_views: PatchViews | None = None
         self.radiance_scale = facts.radiance_scale
         self.background_kind = facts.background
@@ -90,13 +92,13 @@ class VolSdfHost(nn.Module):
         self.sdf_field = SdfField(sdf, config.encoding, radius)
         self.radiance_field = radiance_field(config, facts, sdf.feature_width)
         self.density = LaplaceDensity(volume.beta_init)
-        self.starts_from_shape = False
         self.register_buffer("background_color", torch.tensor(facts.background_color))
         self.background = background_field(config, facts)
         self.cameras = cameras
         balls = None if cameras is None else free_balls(cameras, self.point_position, radius)
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if volume.skip_empty else None
+        self.sample_counts = sample_counts(volume)
         hard = config.light.inter_reflection == "hard"
         resolution = GRID_RESOLUTION if hard else 0
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
@@ -106,20 +108,6 @@ class VolSdfHost(nn.Module):
         self._evaluation_space: EvaluationSpace | None = None
 
     # -------------------------------------------------------------------------------------- the host contract
-
-    @property
-    def starts_from_shape(self) -> bool:
-        """Whether G has been fitted to a known shape (`train.start`); in checkpoints. It decides on the
-        density "auto".
-        """
-        return self._starts_from_shape
-
-    @starts_from_shape.setter
-    def starts_from_shape(self, starts: bool) -> None:
-        self._starts_from_shape, volume = starts, self.config.host.volume
-        automatic = "entering" if starts else "isotropic"
-        self.density.kind = automatic if volume.density == "auto" else volume.density
-        self.sample_counts = sample_counts(volume, self.density.kind == "entering")
 
     def render(self, rays: RayBatch) -> SurfaceHits:
         """Colour, position and normal of each ray, blended with the rendering weights (METHOD §3).
@@ -154,7 +142,8 @@ class VolSdfHost(nn.Module):
         which surfaces lie the deeper, the wider the layer is.
         """
         is_automatic = self.config.host.volume.density == "auto"
-        self.density.limit_(0.5 * width if is_automatic and self.density.kind == "isotropic" else width)
+        is_half = is_automatic and self.density_kind == "isotropic"
+        self.density.limit_(0.5 * width if is_half else width)
 
     def parameter_groups(self) -> Mapping[str, list[nn.Parameter]]:
         """The parameters by field."""
@@ -217,6 +206,14 @@ class VolSdfHost(nn.Module):
         self.grid_age, self.starts_from_shape = state["grid_age"], state["starts_from_shape"]
 
     # ----------------------------------------------------------------------------------------------- geometry
+
+    @property
+    def density_kind(self) -> DensityKind:
+        """The kind of density; "auto" is entering if geometry starts from a known shape."""
+        kind = self.config.host.volume.density
+        if kind != "auto":
+            return kind
+        return "entering" if self.starts_from_shape else "isotropic"
 
     @property
     def points(self) -> OrientedPoints | None:
@@ -287,13 +284,15 @@ class VolSdfHost(nn.Module):
             interval = Interval(narrow.near, interval.far) if self.background_kind == "none" else narrow
             narrowed = True
         counts = self.sample_counts.of_narrowed_rays() if narrowed else self.sample_counts
+        counts = replace(counts, with_nearest=self.density_kind == "entering")
         distances = self._sample(rays, interval, counts)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
         if surface.distance.requires_grad:
             # A step may follow, and the fused optimizers do not count the versions of parameters.
             self._evaluation_space = None
-        weights = depth_weights(self.density(surface.distance.reshape(distances.shape), distances))
+        sdf = surface.distance.reshape(distances.shape)
+        weights = depth_weights(optical_depth(self.density_kind, sdf, distances, self.density.beta()))
         normals = safe_normalize(surface.gradient)
         radiance = None
         if colored:
@@ -351,9 +350,8 @@ class VolSdfHost(nn.Module):
     def _regularizers(self, march: March, batch: PixelBatch, names: Collection[str]) -> dict[str, LossTerm]:
         terms = {}
         if {"eikonal", "surface", "hessian"} & set(names):
-            inputs = regularizer_inputs(
-                self.config.host.loss.points, march.surface, march.hits.position, self.sdf_field, self.radius
-            )
+            where, field = self.config.host.loss.points, self.sdf_field.with_gradient
+            inputs = regularizer_inputs(where, march.surface, march.hits.position, field, self.radius)
         if "eikonal" in names:
             terms["eikonal"] = losses.eikonal(inputs.gradient)
         if "surface" in names:
@@ -375,5 +373,5 @@ class VolSdfHost(nn.Module):
     def _mask_loss(self, march: March, batch: PixelBatch) -> LossTerm:
         """The mask loss, with β detached: it must move surfaces, not widen them."""
         beta, distance = self.density.beta().detach(), march.surface.distance.view_as(march.distances)
-        depth = self.density.depth(distance, march.distances, beta).sum(-1)
+        depth = optical_depth(self.density_kind, distance, march.distances, beta).sum(-1)
         return losses.mask(depth, batch.mask, batch.mask_known, beta)

@@ -84,7 +84,7 @@ def surface_depth(
         weights: rendering weights of the samples.
         distances: of the samples along the ray, scene units.
         sdf: signed distances G at the samples, scene units.
-        slope: dG/dt along the ray at the samples; no gradient flows through it.
+        slope: dG/dt along the ray at the samples.
 
     Returns:
         Depths between the first and the last sample, scene units; that of the last for a ray without weight.
@@ -96,7 +96,7 @@ def surface_depth(
     """
     opacity = weights.sum(-1)
     mean = ((weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]) / (opacity + SPARE_WEIGHT)
-    fall = torch.maximum(-(weights * slope).sum(-1), MIN_SLOPE * opacity).detach()
+    fall = torch.maximum(-(weights * slope).sum(-1), MIN_SLOPE * opacity)
     inside = (weights * sdf).sum(-1).clamp_max(0.0)
     depth = mean + inside / (fall + SPARE_WEIGHT)
     return torch.clamp(depth, distances[:, 0], distances[:, -1])

@@ -24,7 +24,17 @@ from torch import Tensor, nn
 
 from neilfpp_method.errors import UserError
 
-__all__ = ["LaplaceDensity", "entering_depth", "laplace_density", "laplace_depth"]
+__all__ = [
+    "DensityKind",
+    "LaplaceDensity",
+    "entering_depth",
+    "laplace_density",
+    "laplace_depth",
+    "optical_depth",
+]
+
+DensityKind = Literal["isotropic", "entering"]
+"""That of VolSDF, or the one that acts only where a ray enters."""
 
 SIMPSON_BELOW = 0.03
 """Difference of the signed distance over an interval, in units of β, below which Simpson's rule replaces the
@@ -126,6 +136,16 @@ def entering_depth(
     return torch.cat([before + depth[..., :1], depth[..., 1:]], dim=-1)
 
 
+def optical_depth(
+    kind: DensityKind,
+    sdf: Float[Tensor, "*shape M"],
+    distances: Float[Tensor, "*shape M"],
+    beta: Float[Tensor, "*#shape"],
+) -> Float[Tensor, "*shape M-1"]:
+    """`laplace_depth` or `entering_depth`, by the kind of density."""
+    return entering_depth(sdf, beta) if kind == "entering" else laplace_depth(sdf, distances, beta)
+
+
 def _antiderivative_differences(scaled: Float[Tensor, "*shape M"]) -> Float[Tensor, "*shape M-1"]:
     """F(u₁) − F(u₀) of neighbouring u = sdf/β, with F(u) = min(u, 0) − ½ e^{−|u|}, F' = Ψ(−u)."""
     outside, inside = torch.relu(scaled), scaled.clamp_max(0.0)
@@ -135,23 +155,17 @@ def _antiderivative_differences(scaled: Float[Tensor, "*shape M"]) -> Float[Tens
 
 
 class LaplaceDensity(nn.Module):
-    """The Laplace density with a learned scale β = |parameter| + floor (VolSDF).
+    """The learned scale of the Laplace density, β = |parameter| + floor (VolSDF).
 
     Args:
         beta_init: initial β, scene units.
         beta_floor: smallest β, scene units.
-        kind: "isotropic" (VolSDF), or "entering"; may be changed between steps.
 
     Raises:
         UserError: the initial β is not above the floor, or the floor is not positive.
     """
 
-    def __init__(
-        self,
-        beta_init: float,
-        beta_floor: float = BETA_FLOOR,
-        kind: Literal["isotropic", "entering"] = "isotropic",
-    ) -> None:
+    def __init__(self, beta_init: float, beta_floor: float = BETA_FLOOR) -> None:
         super().__init__()
         if not 0.0 < beta_floor < beta_init:
             raise UserError(
@@ -159,7 +173,7 @@ class LaplaceDensity(nn.Module):
                 "must be above 0",
                 f"choose a host.volume.beta_init above {BETA_FLOOR}",
             )
-        self.kind, self.beta_floor = kind, beta_floor
+        self.beta_floor = beta_floor
         self.above_floor = nn.Parameter(torch.tensor(beta_init - beta_floor))
 
     def beta(self) -> Float[Tensor, ""]:
@@ -171,13 +185,3 @@ class LaplaceDensity(nn.Module):
         """Lower the scale to `beta` if it is larger; the floor stays."""
         largest = max(beta - self.beta_floor, 0.0)
         self.above_floor.clamp_(-largest, largest)
-
-    def forward(self, sdf: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, "N M-1"]:
-        """Optical depth between the samples of rays."""
-        return self.depth(sdf, distances, self.beta())
-
-    def depth(
-        self, sdf: Float[Tensor, "N M"], distances: Float[Tensor, "N M"], beta: Float[Tensor, ""]
-    ) -> Float[Tensor, "N M-1"]:
-        """As `forward`, with a scale of its own."""
-        return entering_depth(sdf, beta) if self.kind == "entering" else laplace_depth(sdf, distances, beta)

@@ -159,10 +159,10 @@ class SampleCounts:
         return replace(self, cuts=self.cuts // 2)
 
 
-def sample_counts(config: VolumeConfig, with_nearest: bool = False) -> SampleCounts:
-    """The counts that suit the settings, for whole rays; for `with_nearest` see `SampleCounts`."""
+def sample_counts(config: VolumeConfig) -> SampleCounts:
+    """The counts that suit the settings, for whole rays."""
     cuts, rounds = (SKIPPING_CUTS, SKIPPING_ROUNDS) if config.skip_empty else (CUTS, ROUNDS)
-    return SampleCounts(cuts, rounds, config.samples, with_nearest)
+    return SampleCounts(cuts, rounds, config.samples)
 
 
 @dataclass(frozen=True)

@@ -177,15 +177,13 @@ CASES = {
         {**PAINT_BOUNDS, "scaled_base_color": 0.13, "roughness": 0.11},
         {"gains": HALF_STOPS, "exposure": True, "cloud": CLOUD},
     ),
-    # Without a cloud the gains are not measured before the training.
+    # Without a cloud the gains are not measured before the training (`NOT_RECOVERED`).
     "paint, exposures of ± ½ EV": Case(
         PAINT,
         {
             "outline": 0.05,
             "normal": 20.0,
             "position": 0.048,
-            "scaled_base_color": 0.18,
-            "roughness": 0.22,
             "metallic": 0.24,
             "image": 0.33,
             "radiance": 0.3,
@@ -254,6 +252,8 @@ CASES = {
     ),
 }
 NOT_RECOVERED = [
+    ("paint, exposures of ± ½ EV", "scaled_base_color", 0.12),
+    ("paint, exposures of ± ½ EV", "roughness", 0.1),
     ("paint, LDR", "roughness", 0.1),
     ("polished metal, mesh", "roughness", 0.1),
     ("polished metal, mesh, known map", "roughness", 0.1),
@@ -310,8 +310,9 @@ def test_surface_material_and_light_are_recovered_together(name):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="an over-exposed highlight hides the roughness, few directions make polished metal a mirror, and "
-    "the reflections of a recovered mirror are not sharp (docs/stability.md)",
+    reason="an over-exposed highlight hides the roughness, few directions make polished metal a mirror, the "
+    "reflections of a recovered mirror are not sharp, and gains that are not measured at a cloud are hardly "
+    "learned (docs/stability.md)",
 )
 @pytest.mark.parametrize(("name", "measure", "bound"), NOT_RECOVERED)
 def test_values_that_are_not_recovered(name, measure, bound):

@@ -11,7 +11,13 @@ from scipy.integrate import quad
 from scipy.stats import laplace
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.volume.density import LaplaceDensity, entering_depth, laplace_density, laplace_depth
+from neilfpp_method.volume.density import (
+    LaplaceDensity,
+    entering_depth,
+    laplace_density,
+    laplace_depth,
+    optical_depth,
+)
 
 
 @pytest.mark.parametrize("beta", [0.5, 0.1, 0.003])
@@ -138,9 +144,7 @@ def test_the_kind_determines_the_depth():
     sdf, cuts, beta = torch.tensor([[0.2, -0.1]]), torch.tensor([[1.0, 3.0]]), torch.tensor(0.05)
     expected = {"isotropic": laplace_depth(sdf, cuts, beta), "entering": entering_depth(sdf, beta)}
     for kind, depth in expected.items():
-        density = LaplaceDensity(0.05, kind=kind)
-        assert torch.equal(density.depth(sdf, cuts, beta), depth)
-        torch.testing.assert_close(density(sdf, cuts), depth)
+        assert torch.equal(optical_depth(kind, sdf, cuts, beta), depth)
 
 
 # ------------------------------------------------------------------------------------------------------ scale

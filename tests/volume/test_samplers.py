@@ -151,7 +151,7 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
 
 
 def test_rays_that_skip_empty_space_are_cut_less_often():
-    skipping = sample_counts(preset("fast").host.volume, with_nearest=True)
+    skipping = dataclasses.replace(sample_counts(preset("fast").host.volume), with_nearest=True)
     assert skipping == SampleCounts(cuts=64, rounds=2, rendered=32, with_nearest=True)
     assert skipping.of_narrowed_rays() == SampleCounts(cuts=32, rounds=2, rendered=32, with_nearest=True)
     assert sample_counts(preset("paper-mlp").host.volume) == COUNTS
