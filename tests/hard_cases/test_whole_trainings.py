@@ -81,8 +81,6 @@ PAPER = {
 }
 """Differences from `small_paper_ngp`: fewer samples per ray and point, rays and steps."""
 
-POLISHED_STEPS = {"train.material_steps": 1000, "shading.train_samples": 64}
-"""Differences from `SMALLER` for polished metal; as many directions per point as in `fast`."""
 SURFACE_ONLY = {"train.sdf_steps": 400, "train.rays": 192, "train.material_steps": 0, "train.joint_steps": 0}
 """Differences from `SMALLER` for shapes whose material is not compared."""
 
@@ -229,7 +227,7 @@ CASES = {
             "image": 0.1,
             "radiance": 0.55,
         },
-        {"config": small_mesh(small_fast()), "changes": POLISHED_STEPS, "mesh": BALL},
+        {"config": small_mesh(small_fast()), "changes": {"train.material_steps": 1000}, "mesh": BALL},
     ),
     # It is found as a mirror (`NOT_RECOVERED`).
     "polished metal, mesh, known map": Case(

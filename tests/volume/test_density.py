@@ -153,7 +153,8 @@ def test_the_kind_determines_the_depth():
 def test_beta_starts_at_the_given_value_and_stays_above_its_floor():
     density = LaplaceDensity(beta_init=0.1, beta_floor=1e-4)
     assert density.beta().item() == pytest.approx(0.1)
-    assert density(torch.zeros(1, 2), torch.tensor([[1.0, 3.0]])).item() == pytest.approx(2.0 * 0.5 / 0.1)
+    depth = optical_depth("isotropic", torch.zeros(1, 2), torch.tensor([[1.0, 3.0]]), density.beta())
+    assert depth.item() == pytest.approx(2.0 * 0.5 / 0.1)
     with torch.no_grad():
         density.above_floor.fill_(-0.2)
     assert density.beta().item() == pytest.approx(0.2 + 1e-4)
