@@ -172,4 +172,11 @@ LATER_FAULTS: Sequence[Mutant] = (
         'return "entering"',
         "hosts/test_volsdf.py",
     ),
+    Mutant(
+        "hits of the isotropic density lie at its zero set",
+        "hosts/volsdf.py",
+        'if self.density_kind == "isotropic":\n            return mean_depth',
+        "if False:\n            return mean_depth",
+        "hosts/test_volsdf.py",
+    ),
 )

@@ -28,6 +28,7 @@ from neilfpp_method.volume.compositing import (
     Weights,
     composite,
     depth_weights,
+    mean_depth,
     sample_weights,
     share_near,
     surface_depth,
@@ -138,8 +139,8 @@ class VolSdfHost(nn.Module):
         return self.density.beta().detach()
 
     def limit_surface_width(self, width: float) -> None:
-        """Lower β to `width` if it is larger; to half of it if "auto" has chosen the isotropic density, with
-        which surfaces lie the deeper, the wider the layer is.
+        """Lower β to `width` if it is larger; to half of it if "auto" has chosen the isotropic density, whose
+        hits lie the deeper, the wider the layer is.
         """
         is_automatic = self.config.host.volume.density == "auto"
         is_half = is_automatic and self.density_kind == "isotropic"
@@ -316,8 +317,7 @@ class VolSdfHost(nn.Module):
         radiance: Float[Tensor, "N M 3"] | None,
     ) -> SurfaceHits:
         weights = sample_weights(intervals.weights)
-        slope = (surface.gradient.view_as(normals) * rays.directions[:, None]).sum(-1)
-        depth = surface_depth(weights, distances, surface.distance.view_as(weights), slope)
+        depth = self._depth(rays, distances, weights, surface)
         color = torch.zeros_like(rays.origins)
         if radiance is not None:
             color = composite(weights, radiance)
@@ -329,6 +329,23 @@ class VolSdfHost(nn.Module):
             opacity=intervals.opacity,
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
+
+    def _depth(
+        self,
+        rays: RayBatch,
+        distances: Float[Tensor, "N M"],
+        weights: Float[Tensor, "N M"],
+        surface: SdfSample,
+    ) -> Float[Tensor, " N"]:
+        """Depth of the hits: of the zero set with the entering density, else the mean of the samples.
+
+        With the isotropic density slanted rays become opaque further outside than others, and G settles where
+        the mean of all of them is right. Hits at its zero set were up to twice as far from the true surface.
+        """
+        if self.density_kind == "isotropic":
+            return mean_depth(weights, distances)
+        slope = (surface.gradient.view(*weights.shape, 3) * rays.directions[:, None]).sum(-1)
+        return surface_depth(weights, distances, surface.distance.view_as(weights), slope)
 
     def _background(
         self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]

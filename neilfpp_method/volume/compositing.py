@@ -13,6 +13,7 @@ __all__ = [
     "Weights",
     "composite",
     "depth_weights",
+    "mean_depth",
     "render_weights",
     "sample_weights",
     "share_near",
@@ -68,6 +69,17 @@ def sample_weights(weights: Float[Tensor, "N K"]) -> Float[Tensor, "N K+1"]:
     return 0.5 * (torch.nn.functional.pad(weights, (1, 0)) + torch.nn.functional.pad(weights, (0, 1)))
 
 
+def mean_depth(weights: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -> Float[Tensor, " N"]:
+    """Mean depth of the samples of each ray by their rendering weights; that of the last for an empty ray.
+
+    Args:
+        weights: rendering weights of the samples.
+        distances: of the samples along the ray, scene units.
+    """
+    weighted = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
+    return weighted / (weights.sum(-1) + SPARE_WEIGHT)
+
+
 def surface_depth(
     weights: Float[Tensor, "N M"],
     distances: Float[Tensor, "N M"],
@@ -94,8 +106,7 @@ def surface_depth(
         >>> surface_depth(torch.tensor([[0.5, 0.5]]), distances, 1.05 - distances, -torch.ones(1, 2))
         tensor([1.0500])
     """
-    opacity = weights.sum(-1)
-    mean = ((weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]) / (opacity + SPARE_WEIGHT)
+    mean, opacity = mean_depth(weights, distances), weights.sum(-1)
     fall = torch.maximum(-(weights * slope).sum(-1), MIN_SLOPE * opacity)
     inside = (weights * sdf).sum(-1).clamp_max(0.0)
     depth = mean + inside / (fall + SPARE_WEIGHT)

@@ -64,6 +64,16 @@ def test_hits_lie_much_closer_to_the_zero_set_than_the_layer_is_wide():
     assert off.quantile(0.9) < 0.15 * beta  # the mean depth of such rays is 0.4 β inside
 
 
+def test_hits_of_the_isotropic_density_are_the_mean_of_the_samples():
+    """0.34 β inside where a ray meets the surface head-on: there both densities have the same weights."""
+    beta = 4e-3
+    config = changed(tiny_config(), {"host.volume": {"beta_init": beta, "samples": 64}})
+    host = sphere_model(config).eval().host
+    directions = normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    hits = host.render(RayBatch(-2.5 * directions, directions))
+    assert host.sdf(hits.position).median().item() == pytest.approx(-0.34 * beta, abs=0.05 * beta)
+
+
 def test_a_miss_has_the_background_color(sharp):
     sharp.background_color.fill_(0.25)
     misses = RayBatch(torch.tensor([[0.0, 0.0, -3.0], [0.0, 9.0, -3.0]]), torch.tensor([[0.0, 1.0, 0.0]] * 2))
