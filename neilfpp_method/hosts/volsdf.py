@@ -140,7 +140,7 @@ class VolSdfHost(nn.Module):
 
     def limit_surface_width(self, width: float) -> None:
         """Lower β to `width` if it is larger; to half of it if "auto" has chosen the isotropic density, whose
-        hits lie the deeper, the wider the layer is.
+        hits are not moved to the zero set: their distance from it grows with the width.
         """
         is_automatic = self.config.host.volume.density == "auto"
         is_half = is_automatic and self.density_kind == "isotropic"
