@@ -339,8 +339,8 @@ class VolSdfHost(nn.Module):
     ) -> Float[Tensor, " N"]:
         """Depth of the hits: of the zero set with the entering density, else the mean of the samples.
 
-        With the isotropic density slanted rays become opaque further outside than others, and G settles where
-        the mean of all of them is right. Hits at its zero set were up to twice as far from the true surface.
+        On shapes that are learned from a ball, hits at the zero set of the isotropic density were up to twice
+        as far from the true surface as the mean.
         """
         if self.density_kind == "isotropic":
             return mean_depth(weights, distances)
