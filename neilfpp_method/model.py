@@ -179,14 +179,15 @@ class NeilfModel(nn.Module):
         material, priors = self._material_and_priors(surface, active)
         terms |= priors
 
-        # 4. Incident light L: sample directions wi and compute the radiance that arrives along them.
-        incident = self._incident(position, normal, wo, material, self.config.shading.train_samples)
+        # 4. Incident light L: sample directions wi, in two independent halves, and the radiance along them.
+        count = max(1, self.config.shading.train_samples // 2)
+        halves = [self._incident(position, normal, wo, material, count) for _ in range(2)]
 
-        # 5. Rendering equation: outgoing radiance towards wo, compared with the pixel.
+        # 5. Rendering equation: outgoing radiance towards wo by each half, compared with the pixel.
         with timed("shading"):
-            shading = shade(material, normal, wo, incident, self.lobe)
-        terms["physical"] = losses.photometric(
-            shading.color, surface.pixel, self.facts.response, self.units.physical
+            one, other = (shade(material, normal, wo, half, self.lobe).color for half in halves)
+        terms["physical"] = losses.physical(
+            one, other, surface.pixel, self.facts.response, self.units.physical
         )
 
         # 6. Inter-reflection: where a ray along wi hits the scene again, L here must equal R there.

@@ -18,6 +18,47 @@ def test_photometric_is_l1_over_the_scale_in_linear_radiance():
     assert term.values.tolist()[0] == pytest.approx([0.3 / 3, 0.5 / 3, 1.0 / 3])
 
 
+def test_without_noise_the_physical_loss_is_the_photometric_one():
+    radiance, pixel = torch.rand(50, 3, requires_grad=True), torch.rand(50, 3)
+    for response in ("linear", "srgb"):
+        found = []
+        for term in (
+            losses.physical(radiance, radiance, pixel, response, 2.0),
+            losses.photometric(radiance, pixel, response, 2.0),
+        ):
+            found.append((term.values, *torch.autograd.grad(term.mean(), radiance)))
+        torch.testing.assert_close(*found)
+
+
+def test_the_physical_loss_does_not_prefer_little_noise():
+    """Estimates mean + deviation · noise of a pixel. The absolute error of one estimate grows with the
+    deviation: its derivative is √(2/π) for normal noise.
+    """
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(2, 200_000, 3, generator=generator)
+    mean, deviation = (torch.tensor(value, requires_grad=True) for value in (0.5, 0.2))
+    one, other = mean + deviation * noise
+    pixel = torch.full_like(one, 0.5)
+
+    def derivatives(term):
+        return [g.item() for g in torch.autograd.grad(term.mean(), (mean, deviation), retain_graph=True)]
+
+    biased = derivatives(losses.photometric(one, pixel, "linear"))
+    assert biased == pytest.approx([0.0, (2 / math.pi) ** 0.5], abs=0.005)
+    assert derivatives(losses.physical(one, other, pixel, "linear")) == pytest.approx([0.0, 0.0], abs=0.005)
+    # A mean that is off by half a deviation: the sign of an error is right with probability 0.69.
+    found = derivatives(losses.physical(one, other, pixel - 0.1, "linear"))
+    assert found == pytest.approx([0.383, 0.0], abs=0.005)
+    term = losses.physical(one, other, pixel, "linear")
+    torch.testing.assert_close(term.values, (0.5 * (one + other) - pixel).abs())
+
+
+def test_a_clipped_pixel_is_a_lower_bound_for_both_estimates():
+    one, other = torch.full((1, 3), 4.0, requires_grad=True), torch.full((1, 3), 0.1, requires_grad=True)
+    term = losses.physical(one, other, torch.ones(1, 3), "srgb")
+    assert not any(gradient.any() for gradient in torch.autograd.grad(term.mean(), (one, other)))
+
+
 def test_photometric_clips_and_encodes_for_ldr_pixels():
     term = losses.photometric(torch.tensor([[0.0, 0.5, 7.0]]), torch.tensor([[0.0, 0.735357, 1.0]]), "srgb")
     assert term.values.abs().max() < 1e-5  # sRGB(0.5) = 0.735357; 7 clips to 1

@@ -262,6 +262,19 @@ def test_material_gradients_reach_the_geometry_by_their_scales():
     assert geometry_moves(0.0, 0.1)
 
 
+def test_l_phys_has_two_estimates_from_independent_directions(monkeypatch):
+    """Together they have as many directions as the settings say."""
+    config, estimates = tiny_config(), []
+    compare = losses.physical
+    monkeypatch.setattr(losses, "physical", lambda *args: (estimates.append(args[:2]), compare(*args))[1])
+    model = sphere_model(config)
+    queries = count_queries(model, lambda: model.losses(sphere_batch(spread=0.3), Stage.MATERIAL_INIT))
+    ((one, other),) = estimates
+    assert len(one) > 40
+    assert (one != other).any(-1).all()
+    assert queries["light"] == len(one) * config.shading.train_samples
+
+
 def test_a_batch_without_a_hit_trains_the_remaining_fields():
     model = sphere_model()
     batch = sphere_batch(spread=0.3)

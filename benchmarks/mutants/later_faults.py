@@ -179,4 +179,19 @@ LATER_FAULTS: Sequence[Mutant] = (
         "if False:\n            return mean_depth",
         "hosts/test_volsdf.py",
     ),
+    # L_phys from two estimates.
+    Mutant(
+        "the absolute error of an estimate has its own sign",
+        "losses.py",
+        "first * second.detach().sign() + second * first.detach().sign()",
+        "first * first.detach().sign() + second * second.detach().sign()",
+        "test_losses.py",
+    ),
+    Mutant(
+        "both estimates of the shading have the same directions",
+        "model.py",
+        "halves = [self._incident(position, normal, wo, material, count) for _ in range(2)]",
+        "halves = [self._incident(position, normal, wo, material, count)] * 2",
+        "test_model.py",
+    ),
 )

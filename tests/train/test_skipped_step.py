@@ -34,20 +34,24 @@ def training(tmp_path: Path, capture: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch, training: Training, number: int, spoiled) -> None:
-    """Let `losses.photometric` return `spoiled(errors)` in this step, also when the step is run again."""
-    honest, step = losses.photometric, training.model.step
+    """Let L_vol and L_phys be `spoiled(errors)` in this step, also when the step is run again."""
+    step = training.model.step
     calls, now = iter(range(1000)), [number]
 
     def counted(*arguments):
         now[0] = next(calls)
         return step(*arguments)
 
-    def photometric(*arguments):
-        term = honest(*arguments)
-        return LossTerm(spoiled(term.values)) if now[0] == number else term
+    def spoiling(honest):
+        def loss(*arguments):
+            term = honest(*arguments)
+            return LossTerm(spoiled(term.values)) if now[0] == number else term
+
+        return loss
 
     training.model.step = counted
-    monkeypatch.setattr(losses, "photometric", photometric)
+    for name in ("photometric", "physical"):
+        monkeypatch.setattr(losses, name, spoiling(getattr(losses, name)))
     monkeypatch.setattr(
         "neilfpp_method.train.rerun.load_step", lambda *a: (now.__setitem__(0, number), load_step(*a))[1]
     )
