@@ -34,7 +34,7 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train.optimizer import seed_step
-from neilfpp_method.volume.samplers import sample_counts
+from neilfpp_method.volume.partition import sample_counts
 
 __all__ = ["Growth", "StraightLine", "straight_line"]
 

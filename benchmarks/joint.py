@@ -36,7 +36,7 @@ from neilfpp_method.settings.presets import preset
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import PixelBatch
 from neilfpp_method.train.optimizer import make_optimizer, seed_step
-from neilfpp_method.volume.samplers import sample_counts
+from neilfpp_method.volume.partition import sample_counts
 
 __all__ = ["cheap_paper", "fitted_model", "measurements", "rays_at_the_table", "step_on", "table"]
 

@@ -23,7 +23,7 @@ from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.empty_space import MAX_LIFE, RESOLUTION
-from neilfpp_method.volume.samplers import sample_counts
+from neilfpp_method.volume.partition import sample_counts
 
 __all__ = ["measurements", "queries_per_ray", "table_host"]
 

@@ -35,15 +35,13 @@ from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.structures import Material, RayBatch
 from neilfpp_method.volume.intersect import Interval
+from neilfpp_method.volume.partition import SampleCounts, first_cuts, with_cuts
 from neilfpp_method.volume.samplers import (
     OPACITY_ERROR,
-    SampleCounts,
     bound_shares,
     bounded_beta,
-    first_cuts,
     log_error_bound,
     opacity_samples,
-    with_cuts,
 )
 
 __all__ = ["plain_units", "straightforward"]

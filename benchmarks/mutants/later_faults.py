@@ -147,16 +147,30 @@ LATER_FAULTS: Sequence[Mutant] = (
     Mutant(
         "matter in front of a camera is invisible",
         "volume/density.py",
-        "torch.cat([before + depth[..., :1]",
+        "torch.cat([depth_at(sdf[..., :1], beta) + depth[..., :1]",
         "torch.cat([depth[..., :1]",
         "volume/test_density.py",
     ),
     Mutant(
         "the rendered cut is the most distant one",
-        "volume/samplers.py",
+        "volume/entering_samples.py",
         "partition.sdf.argmin(",
         "partition.sdf.argmax(",
-        "volume/test_samplers.py",
+        "volume/test_entering_samples.py",
+    ),
+    Mutant(
+        "an interval with both ends outside cannot contain a thin object",
+        "volume/entering_samples.py",
+        "torch.where(is_outside, nearest, deepest)",
+        "nearest",
+        "volume/test_entering_samples.py",
+    ),
+    Mutant(
+        "the slope of the field is at most 1 wherever rays skip space",
+        "volume/empty_space.py",
+        "MARGIN * largest.clamp_min(1.0)",
+        "MARGIN * torch.ones_like(largest)",
+        "volume/test_empty_space.py",
     ),
     Mutant(
         "hits are the mean of the samples, inside the surface",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -35,15 +35,19 @@ from neilfpp_method.volume.compositing import (
 )
 from neilfpp_method.volume.density import DensityKind, LaplaceDensity, optical_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, sample_grid, trace_grid
-from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace
+from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace, evaluation_space
+from neilfpp_method.volume.entering_samples import entering_samples
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
 from neilfpp_method.volume.intersect import Interval, sphere_interval
-from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples, sample_counts
+from neilfpp_method.volume.partition import SampleCounts, sample_counts
+from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["VolSdfHost"]
 
 NORMAL_RADIUS = 0.08
 """Radius within which normals are smoothed for shading, scene units."""
+OWN_LOSSES = frozenset({"eikonal", "hessian", "surface", "point_cloud", "mask", "patches"})
+"""Losses that `VolSdfHost.render_regularized` computes."""
 GRID_LIFE = 100
 """Training steps of the geometry after which the distance grid is sampled again."""
 
@@ -116,17 +120,18 @@ class VolSdfHost(nn.Module):
         With `host.volume.skip_empty`, evaluation without gradients samples only the parts of rays that may
         be visible, according to a grid of the current field.
         """
-        # Without a background the scene sphere has the radiance R, so no ray can be skipped.
-        cannot_skip = self.empty_space is None or self.background_kind == "none"
-        if self.training or torch.is_grad_enabled() or cannot_skip:
+        if self.training or torch.is_grad_enabled():
             return self._march(rays).hits
-        return self._render_visible_parts(rays)
+        return self._render_fixed(rays, colored=True)
 
     def render_regularized(self, batch: PixelBatch, names: Collection[str]) -> RegularizedHits:
-        """As `render`, with those of the losses eikonal, hessian, surface, point_cloud, mask and patches
-        in `names`. Without "volume" among them, colours are not evaluated, and are 0.
+        """As `render`, with those of `OWN_LOSSES` that are in `names`. Without "volume" among them, colours
+        are not evaluated, and are 0.
         """
-        march = self._march(batch.rays, colored="volume" in names)
+        colored = "volume" in names
+        if not torch.is_grad_enabled() and not OWN_LOSSES & set(names):
+            return RegularizedHits(self._render_fixed(batch.rays, colored), {})
+        march = self._march(batch.rays, colored=colored)
         if march.surface.distance.requires_grad:
             if self.grid_age is not None:
                 self.grid_age += 1
@@ -252,12 +257,12 @@ class VolSdfHost(nn.Module):
 
     # ---------------------------------------------------------------------------------------------- rendering
 
-    def _render_visible_parts(self, rays: RayBatch) -> SurfaceHits:
+    def _render_fixed(self, rays: RayBatch, colored: bool) -> SurfaceHits:
         """Render a field that is not being trained; rays that miss the scene cost only grid look-ups."""
-        versions = [(id(p), p._version) for p in self.sdf_field.parameters()]
-        if self._evaluation_space is None or self._evaluation_space.versions != versions:
-            space = EmptySpace(self.radius).to(rays.origins)
-            self._evaluation_space = EvaluationSpace(versions, space)
+        # Without a background the scene sphere has the radiance R, so no ray can be skipped.
+        if self.empty_space is None or self.background_kind == "none":
+            return self._march(rays, colored=colored).hits
+        self._evaluation_space = evaluation_space(self._evaluation_space, self.sdf_field, self.radius)
         interval = sphere_interval(rays.origins, rays.directions, self.radius)
         span = self._evaluation_space.space.may_show(self.sdf, rays, interval, self.surface_width())
         zeros = torch.zeros_like(interval.far)
@@ -272,20 +277,19 @@ class VolSdfHost(nn.Module):
         if not len(rows):
             return missed
         part = Interval(span.interval.near[rows], span.interval.far[rows])
-        visible = self._march(rays[rows], part).hits
+        visible = self._march(rays[rows], part, colored).hits
         return missed.map_named(lambda name, values: values.index_put((rows,), getattr(visible, name)))
 
     def _march(self, rays: RayBatch, part: Interval | None = None, colored: bool = True) -> March:
         """Sample and blend rays, in `part` of each if it is known; colours are 0 unless `colored`."""
         interval = part or sphere_interval(rays.origins, rays.directions, self.radius)
         narrowed = part is not None
-        if self.empty_space is not None and self.training:
+        if self.empty_space is not None and self.training and not narrowed:
             narrow = self.empty_space.narrow(self.sdf, rays, interval, self.surface_width())
             # Without a background the scene sphere has the radiance R: rays are sampled up to it.
             interval = Interval(narrow.near, interval.far) if self.background_kind == "none" else narrow
             narrowed = True
         counts = self.sample_counts.of_narrowed_rays() if narrowed else self.sample_counts
-        counts = replace(counts, with_nearest=self.density_kind == "entering")
         distances = self._sample(rays, interval, counts)
         points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
         surface = self._surface(points.reshape(-1, 3))
@@ -305,6 +309,8 @@ class VolSdfHost(nn.Module):
 
     def _sample(self, rays: RayBatch, interval: Interval, counts: SampleCounts) -> Float[Tensor, "N M"]:
         beta = self.density.beta().detach()
+        if self.density_kind == "entering":
+            return entering_samples(self.sdf, rays, interval, beta, counts, self.training)
         return error_bounded_samples(self.sdf, rays, interval, beta, counts, self.training).distances
 
     def _blend(

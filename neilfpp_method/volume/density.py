@@ -27,6 +27,7 @@ from neilfpp_method.errors import UserError
 __all__ = [
     "DensityKind",
     "LaplaceDensity",
+    "depth_at",
     "entering_depth",
     "laplace_density",
     "laplace_depth",
@@ -106,6 +107,20 @@ def laplace_depth(
     return torch.where(close, simpson, quotient) * distances.diff(dim=-1).clamp_min(0.0) / beta
 
 
+def depth_at(sdf: Float[Tensor, "*shape"], beta: Float[Tensor, "*#shape"]) -> Float[Tensor, "*shape"]:
+    """Optical depth −F(d/β) under the entering density of a ray along which G falls from afar to d = `sdf`.
+
+    Returns:
+        Depths > 0, in float32 or wider.
+
+    Example:
+        >>> depth_at(torch.tensor([0.0, -0.8]), torch.tensor(0.1))
+        tensor([0.5000, 8.0002])
+    """
+    scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
+    return 0.5 * torch.exp(-scaled.abs()) + torch.relu(-scaled)
+
+
 def entering_depth(
     sdf: Float[Tensor, "*shape M"], beta: Float[Tensor, "*#shape"]
 ) -> Float[Tensor, "*shape M-1"]:
@@ -131,9 +146,7 @@ def entering_depth(
     """
     scaled = sdf.to(torch.promote_types(sdf.dtype, torch.float32)) / beta
     depth = torch.relu(-_antiderivative_differences(scaled))
-    first = scaled[..., :1]
-    before = 0.5 * torch.exp(-first.abs()) + torch.relu(-first)
-    return torch.cat([before + depth[..., :1], depth[..., 1:]], dim=-1)
+    return torch.cat([depth_at(sdf[..., :1], beta) + depth[..., :1], depth[..., 1:]], dim=-1)
 
 
 def optical_depth(

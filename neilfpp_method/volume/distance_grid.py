@@ -59,10 +59,12 @@ def sample_grid(sdf: SignedDistance, radius: float, resolution: int, like: Tenso
     )
 
 
-def look_up(grid: Float[Tensor, "R R R"], radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-    """Interpolate the distance trilinearly at points; points outside of the cube are clamped to it."""
+def look_up(grid: Float[Tensor, "*C R R R"], radius: float, x: Float[Tensor, "P 3"]) -> Float[Tensor, "*C P"]:
+    """Interpolate a grid, or C of them, trilinearly at points; points outside are clamped to the cube."""
     at = (x / radius).view(1, -1, 1, 1, 3)
-    return functional.grid_sample(grid[None, None], at, padding_mode="border", align_corners=True).view(-1)
+    grids = grid.reshape(1, -1, *grid.shape[-3:])
+    found = functional.grid_sample(grids, at, padding_mode="border", align_corners=True)
+    return found.view(*grid.shape[:-3], len(x))
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Empty space that rays may skip, according to a coarse grid of the distance field.
 
-The grid holds the field at its vertices and a bound L on its slope. Within a distance r of a point with value
-v the field lies in v ± L · r. Parts of rays that this bound shows to be empty are skipped; a plate thinner
-than a cell is not skipped.
+The grid holds the field at its vertices and a bound L on its slope near each of them. Within a distance r of
+a point with value v the field lies in v ± L · r. Parts of rays that this bound shows to be empty are skipped;
+a plate thinner than a cell is not skipped.
 
 The field changes while it is trained. So every use checks the field itself at one random point per ray in the
 part to be skipped. If one of them is not empty, no ray skips anything, and the grid is soon sampled again.
@@ -16,19 +16,24 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
 
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.distance_grid import SignedDistance, cell_size, look_up, sample_grid
 from neilfpp_method.volume.intersect import Interval
 
-__all__ = ["EmptySpace", "EvaluationSpace", "Span"]
+__all__ = ["EmptySpace", "EvaluationSpace", "Span", "evaluation_space"]
 
 RAY_PARTS = 128
 """Number of parts of a ray; the grid is read once in each."""
 RESOLUTION = 64
 """Vertices along an edge of the grid."""
 MARGIN = 1.1
-"""Ratio of the bound on the slope to the largest slope between neighbouring vertices."""
+"""Ratio of the bound on the slope to the largest slope between neighbouring vertices nearby."""
+NEARBY = 1
+"""Number of cells in each direction from an edge of the grid in which its slope counts. A part of a ray is
+half as long as a cell, so the bound at its centre holds in all of it.
+"""
 MAX_OPACITY_IN_TRAINING = 0.01
 """Largest opacity of skipped space in training."""
 MAX_OPACITY_IN_EVALUATION = 1e-3
@@ -60,6 +65,14 @@ class _Parts:
         return ~self.empty & ~self.hidden
 
 
+@dataclass(frozen=True)
+class _Reading:
+    """The field in each part of rays: the grid's value at its centre, and the largest deviation from that."""
+
+    distance: Float[Tensor, "N K"]
+    deviation: Float[Tensor, "N K"]
+
+
 class EmptySpace(nn.Module):
     """The grid and its age. Both are in checkpoints, so that a resumed run skips the same space.
 
@@ -71,7 +84,7 @@ class EmptySpace(nn.Module):
         super().__init__()
         self.radius = radius
         self.register_buffer("distance", torch.zeros(RESOLUTION, RESOLUTION, RESOLUTION))
-        self.register_buffer("slope", torch.zeros(()))
+        self.register_buffer("slope", torch.ones(RESOLUTION, RESOLUTION, RESOLUTION))
         self.age: int | None = None
 
     def moved(self) -> None:
@@ -139,9 +152,9 @@ class EmptySpace(nn.Module):
         """
         self._renew(sdf)
         edges = self._edges(interval)
-        distance = self._read(rays, edges)
-        empty = distance - self._max_error(edges) > self._clearance(beta, MAX_OPACITY_IN_TRAINING)
-        return ((distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
+        read = self._read(rays, edges)
+        empty = read.distance - read.deviation > self._clearance(beta, MAX_OPACITY_IN_TRAINING)
+        return ((read.distance.diff(dim=-1) < 0.0) & ~empty[:, 1:]).any(-1)
 
     def _renew(self, sdf: SignedDistance) -> None:
         if self.age is None or self.age >= MAX_LIFE:
@@ -149,8 +162,7 @@ class EmptySpace(nn.Module):
 
     def _sample(self, sdf: SignedDistance) -> None:
         self.distance.copy_(sample_grid(sdf, self.radius, RESOLUTION, self.distance))
-        steps = torch.stack([self.distance.diff(dim=axis).abs().amax() for axis in range(3)])
-        self.slope.copy_(MARGIN * steps.amax() / cell_size(self.distance, self.radius))
+        self.slope.copy_(_slope_nearby(self.distance, cell_size(self.distance, self.radius)))
         self.age = 0
 
     def _parts(
@@ -160,29 +172,29 @@ class EmptySpace(nn.Module):
         clearance: Float[Tensor, ""],
         beta: Float[Tensor, ""],
     ) -> _Parts:
-        width, distance, error = edges.diff(dim=-1), self._read(rays, edges), self._max_error(edges)
+        width, read = edges.diff(dim=-1), self._read(rays, edges)
         # Inside, the isotropic density is at least 1 / (2 β). The opacity of the entering density grows with
         # the depth, not with the path. Few rays stay within a few β of the surface for so long, and they lose
         # an opacity of 2 % at most (tests/volume/test_empty_space.py).
-        depth = ((distance + error < 0.0) * width / (2.0 * beta)).cumsum(dim=-1)
-        return _Parts(distance - error > clearance, depth - width / (2.0 * beta) > OPAQUE_DEPTH)
+        inside = read.distance + read.deviation < 0.0
+        depth = (inside * width / (2.0 * beta)).cumsum(dim=-1)
+        empty = read.distance - read.deviation > clearance
+        return _Parts(empty, depth - width / (2.0 * beta) > OPAQUE_DEPTH)
 
     def _edges(self, interval: Interval) -> Float[Tensor, "N E"]:
         """The ends of the equal parts of each ray."""
         share = torch.linspace(0, 1, RAY_PARTS + 1, device=self.distance.device, dtype=interval.near.dtype)
         return torch.lerp(interval.near[:, None], interval.far[:, None], share)
 
-    def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """The grid's distance at the centre of each part."""
+    def _read(self, rays: RayBatch, edges: Float[Tensor, "N E"]) -> _Reading:
+        """Read the grid at the centre of each part."""
         middle = 0.5 * (edges[:, :-1] + edges[:, 1:])
-        points = rays.origins[:, None] + middle[..., None] * rays.directions[:, None]
-        return look_up(self.distance, self.radius, points.reshape(-1, 3)).view(middle.shape)
-
-    def _max_error(self, edges: Float[Tensor, "N E"]) -> Float[Tensor, "N K"]:
-        """Bound on the difference between the field in a part and the grid's value at its centre."""
+        points = (rays.origins[:, None] + middle[..., None] * rays.directions[:, None]).reshape(-1, 3)
+        distance, slope = look_up(torch.stack([self.distance, self.slope]), self.radius, points)
         # The error of interpolation in a cell is at most the slope times half of the cell's diagonal.
         reach = 0.5 * math.sqrt(3.0) * cell_size(self.distance, self.radius)
-        return self.slope * (0.5 * edges.diff(dim=-1) + reach)
+        deviation = slope.view(middle.shape) * (0.5 * edges.diff(dim=-1) + reach)
+        return _Reading(distance.view(middle.shape), deviation)
 
     def _clearance(self, beta: Float[Tensor, ""], missed: float) -> Float[Tensor, ""]:
         """Distance from the surface beyond which a ray has an opacity of at most `missed`."""
@@ -213,6 +225,18 @@ class EmptySpace(nn.Module):
         self.age = state["age"]
 
 
+def _slope_nearby(distance: Float[Tensor, "R R R"], cell: float) -> Float[Tensor, "R R R"]:
+    """A bound on the slope of the field near each vertex: of the differences along the edges, at least 1."""
+    squared = torch.zeros_like(distance)
+    for axis in range(3):
+        step = distance.diff(dim=axis).abs() / cell
+        before = torch.cat([step.narrow(axis, 0, 1), step], axis)
+        after = torch.cat([step, step.narrow(axis, -1, 1)], axis)
+        squared += torch.maximum(before, after).square()
+    largest = max_pool3d(squared.sqrt()[None], 2 * NEARBY + 1, stride=1, padding=NEARBY)[0]
+    return MARGIN * largest.clamp_min(1.0)
+
+
 def _span(edges: Float[Tensor, "N E"], taken: Bool[Tensor, "N K"], interval: Interval) -> Span:
     first = taken.to(torch.int8).argmax(dim=-1, keepdim=True)
     last = RAY_PARTS - taken.flip(-1).to(torch.int8).argmax(dim=-1, keepdim=True)
@@ -235,3 +259,12 @@ class EvaluationSpace:
 
     versions: list[tuple[int, int]]
     space: EmptySpace
+
+
+def evaluation_space(known: EvaluationSpace | None, field: nn.Module, radius: float) -> EvaluationSpace:
+    """`known` if the parameters of the field still have its versions, else a new one, to be sampled."""
+    parameters = list(field.parameters())
+    versions = [(id(p), p._version) for p in parameters]
+    if known is not None and known.versions == versions:
+        return known
+    return EvaluationSpace(versions, EmptySpace(radius).to(parameters[0]))

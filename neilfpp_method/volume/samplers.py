@@ -1,37 +1,29 @@
-"""The sampler of distances along rays, with bounded opacity error (VolSDF §3).
+"""The sampler of distances along rays for VolSDF's density, with bounded opacity error (VolSDF §3).
 
 The sampler cuts a ray into intervals, bounds the error of the opacity under a density that is constant on
 each interval, and adds cuts where they lower that bound most. No gradient flows through samples.
-
-The rendered samples are of two kinds (published code): most are distributed by opacity, and the rest, with
-both ends of the ray, is spread over the whole ray, so that the density is also sampled where it is low.
-Without the latter a ray that grazes a surface would be rendered too opaque. With the entering density
-(`volume.density`) the cut nearest to the surface is rendered as well.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from neilfpp_method.settings.types import VolumeConfig
-from neilfpp_method.stratified.intervals import inverse_cdf_samples, uniform_samples
-from neilfpp_method.structures import Indexable, RayBatch
+from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
 from neilfpp_method.volume.distance_grid import SignedDistance
 from neilfpp_method.volume.intersect import Interval
+from neilfpp_method.volume.partition import Partition, SampleCounts, first_cuts, samples_within, with_cuts
 
 __all__ = [
     "OPACITY_ERROR",
     "ErrorBoundedSamples",
-    "SampleCounts",
     "error_bounded_samples",
-    "sample_counts",
 ]
 
 OPACITY_ERROR = 0.1
@@ -40,45 +32,8 @@ OPACITY_ERROR = 0.1
 BISECTIONS = 10
 """Number of bisection steps on β (published code)."""
 
-SPREAD_SHARE = 1 / 3
-"""Share of the rendered samples that are spread over the cuts of a ray: 32 of 96 in the published code."""
-
-CUTS, ROUNDS = 128, 5
-"""Cuts per ray in each round, and maximum number of refinement rounds (VolSDF Algorithm 1)."""
-SKIPPING_CUTS, SKIPPING_ROUNDS = 64, 2
-"""The same if rays skip empty space: what is left of them is short."""
-
 
 # -------------------------------------------------------------------------------------------- the error bound
-
-
-@dataclass(frozen=True)
-class Partition(Indexable):
-    """Rays cut into intervals: distances of the E cuts, the SDF there, and width and d* of each interval."""
-
-    distances: Float[Tensor, "N E"]
-    sdf: Float[Tensor, "N E"]
-    width: Float[Tensor, "N E-1"]
-    least_distance: Float[Tensor, "N E-1"]
-
-
-def cut(distances: Float[Tensor, "N E"], sdf: Float[Tensor, "N E"]) -> Partition:
-    """Make a partition of rays from the distances of the cuts and the SDF there.
-
-    d* is a lower bound on the distance between the surface and an interval (VolSDF Theorem 1 and supplement).
-    The surface does not enter the balls of radius |sdf| around the ends of the interval. d* is the distance
-    from the interval to the outside of both balls: to the circle in which the spheres intersect if its
-    projection lies in the interval, else the smaller radius. It is 0 if the spheres do not intersect, or if
-    the sign changes, which is possible as learned distances may be too large.
-    """
-    width = distances.diff(dim=-1)
-    start, end = sdf[:, :-1], sdf[:, 1:]
-    a, b = start.abs(), end.abs()
-    foot = 0.5 * (width + (a - b) * (a + b) / width.clamp_min(torch.finfo(width.dtype).tiny))
-    foot = torch.minimum(foot.clamp_min(0.0), width)
-    rest = width - foot
-    squared = torch.minimum((a - foot) * (a + foot), (b - rest) * (b + rest)).clamp_min(0.0)
-    return Partition(distances, sdf, width, torch.where(start * end > 0.0, squared.sqrt(), 0.0))
 
 
 def optical_depth(partition: Partition, beta: Float[Tensor, "#N 1"]) -> Float[Tensor, "N K"]:
@@ -135,34 +90,6 @@ def bounded_beta(
 
 
 # ---------------------------------------------------------------------------------- the error-bounded sampler
-
-
-@dataclass(frozen=True)
-class SampleCounts:
-    """Numbers of samples per ray.
-
-    Attributes:
-        cuts: SDF queries in the first round of the sampler and in each refinement round.
-        rounds: maximum number of refinement rounds.
-        rendered: samples that are rendered.
-        with_nearest: whether the cut with the smallest signed distance is one of them. The entering density
-            has its opacity from there (`volume.density`).
-    """
-
-    cuts: int
-    rounds: int
-    rendered: int
-    with_nearest: bool = False
-
-    def of_narrowed_rays(self) -> SampleCounts:
-        """The counts for rays of which only the part that is not empty is sampled: half as many cuts."""
-        return replace(self, cuts=self.cuts // 2)
-
-
-def sample_counts(config: VolumeConfig) -> SampleCounts:
-    """The counts that suit the settings, for whole rays."""
-    cuts, rounds = (SKIPPING_CUTS, SKIPPING_ROUNDS) if config.skip_empty else (CUTS, ROUNDS)
-    return SampleCounts(cuts, rounds, config.samples)
 
 
 @dataclass(frozen=True)
@@ -244,49 +171,15 @@ def can_leave_early(device: torch.device) -> bool:
     return device.type == "cpu"
 
 
-def first_cuts(
-    sdf: SignedDistance, rays: RayBatch, interval: Interval, count: int, stochastic: bool
-) -> Partition:
-    """Cut rays uniformly by `count` cuts, both ends included."""
-    distances = uniform_samples(interval.near, interval.far, count, stochastic)
-    return cut(distances, query(sdf, rays, distances))
-
-
-def with_cuts(
-    sdf: SignedDistance,
-    rays: RayBatch,
-    partition: Partition,
-    shares: Float[Tensor, "N K"],
-    count: int,
-    stochastic: bool,
-) -> Partition:
-    """Add `count` cuts to a partition, distributed by the shares of its intervals."""
-    new = inverse_cdf_samples(partition.distances, shares, count, stochastic)
-    distances, order = torch.cat([partition.distances, new], dim=-1).sort(dim=-1)
-    return cut(distances, torch.cat([partition.sdf, query(sdf, rays, new)], dim=-1).gather(-1, order))
-
-
-def query(sdf: SignedDistance, rays: RayBatch, distances: Float[Tensor, "N M"]) -> Float[Tensor, "N M"]:
-    """Signed distance at points along the rays, in the type of the distances."""
-    points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
-    return sdf(points.reshape(-1, 3)).to(distances.dtype).reshape(distances.shape)
-
-
 def opacity_samples(
     partition: Partition, beta: Float[Tensor, "N 1"], counts: SampleCounts, stochastic: bool
 ) -> Float[Tensor, "N {counts.rendered}"]:
     """Samples to render: both ends of each ray, and between them 2/3 by opacity and 1/3 spread over the cuts.
 
     Sampling by opacity inverts the partition's Ô, normalised to 1 at far (VolSDF Algorithm 1, last step).
-    `counts.with_nearest` replaces one of the samples in between by the cut with the smallest signed distance.
     """
     distances = partition.distances
     density = laplace_density(partition.sdf[:, :-1], beta)
     mass = render_weights(density, distances[:, :-1], distances[:, -1]).weights
-    mass = mass / mass.sum(dim=-1, keepdim=True).clamp_min(torch.finfo(mass.dtype).tiny)
-    mass = (1.0 - SPREAD_SHARE) * mass + SPREAD_SHARE / mass.shape[-1]
-    within = inverse_cdf_samples(distances, mass, counts.rendered - 2 - counts.with_nearest, stochastic)
-    if counts.with_nearest:
-        nearest = distances.gather(-1, partition.sdf.argmin(dim=-1, keepdim=True))
-        within = torch.cat([within, nearest], dim=-1).sort(dim=-1).values
+    within = samples_within(partition, mass, counts.rendered - 2, stochastic)
     return torch.cat([distances[:, :1], within, distances[:, -1:]], dim=-1)

@@ -7,7 +7,7 @@ import pytest
 from benchmarks import growth
 from benchmarks.growth import Growth, straight_line, table
 from neilfpp_method.settings.plain import changed
-from neilfpp_method.volume.samplers import sample_counts
+from neilfpp_method.volume.partition import sample_counts
 from tests.scenes import sphere_model, tiny_config
 
 

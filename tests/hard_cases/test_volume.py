@@ -10,7 +10,8 @@ from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.compositing import composite, render_weights
 from neilfpp_method.volume.density import laplace_density
 from neilfpp_method.volume.intersect import Interval, sphere_interval
-from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples
+from neilfpp_method.volume.partition import SampleCounts
+from neilfpp_method.volume.samplers import error_bounded_samples
 from tests.scenes import sphere_distance
 
 COUNTS = SampleCounts(cuts=16, rounds=5, rendered=8)

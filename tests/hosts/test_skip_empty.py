@@ -11,7 +11,7 @@ from neilfpp_method.incident.traced import trace_light
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.volume import empty_space
-from neilfpp_method.volume.samplers import SampleCounts
+from neilfpp_method.volume.partition import SampleCounts
 from tests.scenes import sphere_batch, tiny_config
 
 
@@ -105,8 +105,28 @@ def test_training_skips_empty_space_and_ages_the_grid():
         skipping.render_regularized(sphere_batch(), ())
     assert skipping.empty_space.age == 3
     with torch.no_grad():
-        skipping.render_regularized(sphere_batch(), ())
+        skipping.render_regularized(sphere_batch(), ("mask",))
     assert skipping.empty_space.age == 3  # the geometry was not trained
+
+
+def test_a_stage_that_does_not_train_the_geometry_skips_as_much_as_evaluation(monkeypatch):
+    skipping, batch = host().train(), sphere_batch(200, spread=1.2)
+    with torch.no_grad():
+        evaluated = skipping.eval().render(batch.rays)
+        skipping.train()
+        asked = []
+        monkeypatch.setattr(skipping, "sdf", lambda x: asked.append(len(x)) or skipping.sdf_field(x))
+        found = skipping.render_regularized(batch, ("physical", "volume")).hits
+        spent = sum(asked)
+        plain = skipping.render_regularized(batch, ("physical",)).hits
+        asked.clear()
+        skipping.render_regularized(batch, ("mask",))
+    assert spent < 0.8 * sum(asked)
+    assert skipping.empty_space.age == 0  # only the last call used the grid of training
+    assert (found.opacity - evaluated.opacity).abs().mean() < 0.01
+    assert (found.color - evaluated.color).abs().mean() < 0.01
+    assert not plain.color.any()
+    assert (plain.position - found.position).norm(dim=-1).median() < 0.01
 
 
 def test_hits_do_not_change():

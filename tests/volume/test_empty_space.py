@@ -19,7 +19,8 @@ from neilfpp_method.volume.density import entering_depth, laplace_density, lapla
 from neilfpp_method.volume.distance_grid import cell_size
 from neilfpp_method.volume.empty_space import EmptySpace
 from neilfpp_method.volume.intersect import sphere_interval
-from neilfpp_method.volume.samplers import SampleCounts, error_bounded_samples
+from neilfpp_method.volume.partition import SampleCounts
+from neilfpp_method.volume.samplers import error_bounded_samples
 from tests.scenes import sphere_distance
 
 RADIUS = 1.75
@@ -268,8 +269,32 @@ def test_a_grid_from_a_checkpoint_skips_the_same_parts():
     assert torch.equal(first.far, second.far)
 
 
-def test_the_bound_is_the_largest_slope_of_the_field():
+def test_the_bound_is_the_largest_slope_nearby():
     grid = EmptySpace(RADIUS)
     narrowed(lambda x: 3.0 * x[:, 1], bundle(2), 0.01, grid)
-    assert grid.slope.item() == pytest.approx(empty_space.MARGIN * 3.0, rel=1e-4)
+    assert torch.allclose(grid.slope, torch.tensor(empty_space.MARGIN * 3.0), rtol=1e-4)
     assert cell_size(grid.distance, RADIUS) == pytest.approx(CELL)
+    narrowed(lambda x: 0.1 * x[:, 1], bundle(2), 0.01, grid := EmptySpace(RADIUS))
+    assert torch.allclose(grid.slope, torch.tensor(empty_space.MARGIN))  # a signed distance has slope 1
+    diagonal = torch.ones(3) / math.sqrt(3.0)
+    narrowed(lambda x: 2.0 * x @ diagonal, bundle(2), 0.01, grid := EmptySpace(RADIUS))
+    assert torch.allclose(grid.slope, torch.tensor(empty_space.MARGIN * 2.0), rtol=1e-4)
+
+
+@pytest.mark.parametrize("steepness", [3.0, 8.0, 40.0])
+def test_a_plateau_beside_a_steep_surface_is_not_skipped_up_to_the_surface(steepness):
+    assert_nothing_lost(lambda x: (steepness * sphere_distance(x)).clamp_max(0.3), bundle(400), 0.01)
+
+
+def test_a_steep_field_elsewhere_does_not_matter():
+    """Learned fields are steep in some places, mostly deep inside or behind what cameras see."""
+
+    def steep_inside(x):
+        distance = sphere_distance(x)
+        return torch.where(distance < -0.4, -0.4 + 8.0 * (distance + 0.4), distance)
+
+    rays = bundle()
+    whole, part = narrowed(steep_inside, rays, 0.01)
+    _, plain = narrowed(sphere_distance, rays, 0.01)
+    assert torch.equal(part.near, plain.near)
+    assert (plain.near > whole.near + 0.5).float().mean() > 0.5

@@ -16,14 +16,8 @@ from neilfpp_method.volume import samplers
 from neilfpp_method.volume.compositing import render_weights
 from neilfpp_method.volume.density import laplace_density
 from neilfpp_method.volume.intersect import Interval
-from neilfpp_method.volume.samplers import (
-    OPACITY_ERROR,
-    SPREAD_SHARE,
-    SampleCounts,
-    cut,
-    error_bounded_samples,
-    sample_counts,
-)
+from neilfpp_method.volume.partition import SPREAD_SHARE, SampleCounts, cut, sample_counts
+from neilfpp_method.volume.samplers import OPACITY_ERROR, error_bounded_samples
 from tests.scenes import sphere_distance
 
 F64 = torch.float64
@@ -151,32 +145,10 @@ def test_the_opacity_is_within_the_bound_and_the_bound_within_epsilon(sdf, beta,
 
 
 def test_rays_that_skip_empty_space_are_cut_less_often():
-    skipping = dataclasses.replace(sample_counts(preset("fast").host.volume), with_nearest=True)
-    assert skipping == SampleCounts(cuts=64, rounds=2, rendered=32, with_nearest=True)
-    assert skipping.of_narrowed_rays() == SampleCounts(cuts=32, rounds=2, rendered=32, with_nearest=True)
+    skipping = sample_counts(preset("fast").host.volume)
+    assert skipping == SampleCounts(cuts=64, rounds=2, rendered=32)
+    assert skipping.of_narrowed_rays() == SampleCounts(cuts=32, rounds=2, rendered=32)
     assert sample_counts(preset("paper-mlp").host.volume) == COUNTS
-
-
-@pytest.mark.parametrize("stochastic", [False, True])
-def test_the_cut_with_the_smallest_distance_can_be_rendered(stochastic):
-    """Rays that pass a sphere of radius 0.5: the smallest rendered distance is that of the finest cuts."""
-    rays = RayBatch(
-        torch.stack([torch.linspace(0.51, 0.6, 64), torch.zeros(64), torch.full((64,), -2.0)], dim=-1),
-        torch.tensor([0.0, 0.0, 1.0]).expand(64, 3),
-    )
-    interval, beta = Interval(torch.full((64,), 1.0), torch.full((64,), 3.0)), torch.tensor(0.01)
-    few = SampleCounts(cuts=64, rounds=2, rendered=16)
-
-    def too_far(counts):
-        torch.manual_seed(0)
-        distances = error_bounded_samples(sphere_distance, rays, interval, beta, counts, stochastic).distances
-        assert distances.shape == (64, 16)
-        assert (distances.diff(dim=-1) >= 0.0).all()
-        assert torch.equal(distances[:, 0], interval.near)
-        points = rays.origins[:, None] + distances[..., None] * rays.directions[:, None]
-        return (points.norm(dim=-1).amin(dim=-1) - rays.origins[:, 0]).mean()
-
-    assert too_far(dataclasses.replace(few, with_nearest=True)) < 0.1 * too_far(few)
 
 
 def test_the_bound_shows_when_the_rounds_were_too_few():
