@@ -1,5 +1,5 @@
 """Cost of finding the surface: queries of G per ray by the error-bounded sampler, on whole rays and with
-skipping of empty space.
+skipping of empty space; and, with the entering density, accuracy and time of its sampler against that one.
 
     python -m benchmarks sampler
 
@@ -14,16 +14,21 @@ import dataclasses
 from collections.abc import Iterator
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from benchmarks.joint import SHARP, fitted_model, rays_at_the_table
-from benchmarks.measure import Measurement, median_seconds
+from benchmarks.measure import Measurement, device, median_seconds
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.kernels.process import computing_fast
+from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.plain import changed, to_dict
 from neilfpp_method.settings.presets import free_light, preset
 from neilfpp_method.structures import RayBatch
 from neilfpp_method.volume.empty_space import MAX_LIFE, RESOLUTION
-from neilfpp_method.volume.partition import sample_counts
+from neilfpp_method.volume.intersect import Interval
+from neilfpp_method.volume.partition import SampleCounts, sample_counts
+from neilfpp_method.volume.samplers import error_bounded_samples
 
 __all__ = ["measurements", "queries_per_ray", "table_host"]
 
@@ -35,6 +40,7 @@ WAYS = {
     "empty space skipped, half the cuts": 64,
     "empty space skipped, a quarter of the cuts": 32,
 }
+ENTERING, BOUNDED = "its own sampler", "VolSDF's sampler"
 SCALES = (0.03, 0.01, SHARP)  # of the density: a surface that is found, one that settles, one that has
 
 
@@ -92,6 +98,50 @@ def measurements() -> Iterator[Measurement]:
                 "higher",
                 tolerance=0.5,
             )
+    yield from entering_measurements()
+
+
+class BoundedHost(VolSdfHost):
+    """The entering density with VolSDF's sampler, which knows nothing of it."""
+
+    def _sample(self, rays: RayBatch, interval: Interval, counts: SampleCounts) -> Float[Tensor, "N M"]:
+        beta = self.density.beta().detach()
+        return error_bounded_samples(self.sdf, rays, interval, beta, counts, self.training).distances
+
+
+def entering_measurements() -> Iterator[Measurement]:
+    """With the settings of `fast` and the entering density: deviation of normals from those of 512 samples,
+    mean over the rays, and time.
+    """
+    rays, config = rays_at_the_table(RAYS).rays, free_light(preset("fast"))
+    config = changed(config, {"host.volume.density": "entering"})
+    host = fitted_model(config).host.train()
+    bounded = BoundedHost(host.config, SceneFacts("linear", 0.2, 3.0, "constant")).to(device()).train()
+    bounded.load_state_dict(host.state_dict(), strict=False)
+    hosts = {ENTERING: host, BOUNDED: bounded}
+    with computing_fast(), torch.no_grad():
+        for scale in SCALES:
+            for either in hosts.values():
+                either.density.above_floor.fill_(scale - either.density.beta_floor)
+            host.sample_counts = dataclasses.replace(bounded.sample_counts, cuts=512, rendered=512)
+            truth = host.eval().render(rays).normal
+            host.train().sample_counts = bounded.sample_counts
+            for name, either in hosts.items():
+                cosine = (either.render(rays).normal * truth).sum(-1).clamp(-1.0, 1.0)
+                off = torch.rad2deg(cosine.arccos()).mean().item()
+                yield Measurement(
+                    f"sampler/entering, β {scale:g}, {name}: normal off", off, "°", "lower", tolerance=0.5
+                )
+        slow, fast = median_seconds(
+            *(lambda either=either: either.render(rays) for either in (bounded, host))
+        )
+        yield Measurement(
+            f"sampler/entering, β {SHARP:g}: time, {BOUNDED} over {ENTERING}",
+            slow / fast,
+            "×",
+            "higher",
+            tolerance=0.5,
+        )
 
 
 def with_cuts(host: VolSdfHost, cuts: int) -> VolSdfHost:
