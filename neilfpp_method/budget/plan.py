@@ -30,7 +30,7 @@ __all__ = [
 
 MIN_SHARE = 0.1
 """Smallest useful share of the steps of the settings. With this share, `fast` trains the distance field for
-200 steps and fits the light once; fewer give no recognisable result.
+400 steps and fits the light once; fewer give no recognisable result.
 """
 MAX_SHARE = 8.0
 """Largest share of the steps of the settings. The effect of more steps was not measured."""
