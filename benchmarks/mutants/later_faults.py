@@ -161,7 +161,7 @@ LATER_FAULTS: Sequence[Mutant] = (
     Mutant(
         "an interval with both ends outside cannot contain a thin object",
         "volume/entering_samples.py",
-        "torch.where(is_outside, nearest, deepest)",
+        "torch.minimum(nearest, deepest)",
         "nearest",
         "volume/test_entering_samples.py",
     ),
