@@ -22,7 +22,7 @@ from neilfpp_method.train.run import load_run
 
 __all__ = ["demo_config", "demo_scene", "run_demo"]
 
-STEPS = {"sdf_steps": 1600, "material_steps": 1200, "joint_steps": 100}
+STEPS = {"sdf_steps": 2000, "material_steps": 1200, "joint_steps": 100}
 """Steps of the three stages: fewer than in the preset, for five to ten minutes on two current CPU cores."""
 VIEWS = 3
 """Number of views in the report."""
