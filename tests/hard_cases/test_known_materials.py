@@ -209,8 +209,8 @@ QUICK = {
     ),
     "sun of 1e5": Case(
         KnownBall(sun(1e5), roughness=0.6),
-        {"base_color": 0.026, "roughness": 0.065, "metallic": 0.045, "image": 0.04},
-        {"by_lobe": False},
+        {"base_color": 0.026, "roughness": 0.065, "metallic": 0.045, "image": 0.075},
+        {"by_lobe": False, "samples": 64},
     ),
 }
 LONG = {
