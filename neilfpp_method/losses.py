@@ -73,7 +73,8 @@ def physical(
     for the absolute error.
 
     Args:
-        one, other: linear radiance, estimated from independent samples of the incident light.
+        one, other: linear radiance, estimated from independent samples of the incident light. If both are the
+            same estimate, this is `photometric`.
         pixel, response, unit: as for `photometric`.
 
     Returns:

@@ -179,15 +179,16 @@ class NeilfModel(nn.Module):
         material, priors = self._material_and_priors(surface, active)
         terms |= priors
 
-        # 4. Incident light L: sample directions wi, in two independent halves, and the radiance along them.
-        count = max(1, self.config.shading.train_samples // 2)
-        halves = [self._incident(position, normal, wo, material, count) for _ in range(2)]
+        # 4. Incident light L: sample directions wi, for a solved light in two independent halves.
+        parts = 1 if self.config.light.kind == "free" else 2
+        count = max(1, self.config.shading.train_samples // parts)
+        halves = [self._incident(position, normal, wo, material, count) for _ in range(parts)]
 
         # 5. Rendering equation: outgoing radiance towards wo by each half, compared with the pixel.
         with timed("shading"):
-            one, other = (shade(material, normal, wo, half, self.lobe).color for half in halves)
+            colors = [shade(material, normal, wo, half, self.lobe).color for half in halves]
         terms["physical"] = losses.physical(
-            one, other, surface.pixel, self.facts.response, self.units.physical
+            colors[0], colors[-1], surface.pixel, self.facts.response, self.units.physical
         )
 
         # 6. Inter-reflection: where a ray along wi hits the scene again, L here must equal R there.

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from neilfpp_method import losses
+from neilfpp_method import model as model_module
 from neilfpp_method.hosts.base import TracesLight
 from neilfpp_method.incident.scene import scene_light
 from neilfpp_method.incident.traced import trace_light
@@ -23,6 +24,7 @@ from neilfpp_method.settings.types import MapLightConfig, MeshConfig, NeilfConfi
 from neilfpp_method.structures import Material, RayBatch, SurfaceHits
 from neilfpp_method.train.optimizer import make_optimizer
 from tests.scenes import sphere_batch, sphere_model, tiny_config
+from tests.train.small_runs import solved_light
 
 
 def count_queries(model, run) -> Counter:
@@ -262,17 +264,21 @@ def test_material_gradients_reach_the_geometry_by_their_scales():
     assert geometry_moves(0.0, 0.1)
 
 
-def test_l_phys_has_two_estimates_from_independent_directions(monkeypatch):
-    """Together they have as many directions as the settings say."""
-    config, estimates = tiny_config(), []
-    compare = losses.physical
+@pytest.mark.parametrize("is_free", [True, False])
+def test_l_phys_has_two_independent_estimates_under_a_solved_light(monkeypatch, is_free):
+    """A light field that is learned has one, as published."""
+    config = tiny_config() if is_free else solved_light(tiny_config())
+    estimates, counts, compare, sample = [], [], losses.physical, model_module.sample_directions
     monkeypatch.setattr(losses, "physical", lambda *args: (estimates.append(args[:2]), compare(*args))[1])
-    model = sphere_model(config)
-    queries = count_queries(model, lambda: model.losses(sphere_batch(spread=0.3), Stage.MATERIAL_INIT))
+    monkeypatch.setattr(
+        model_module, "sample_directions", lambda s, *args: (counts.append(s.count), sample(s, *args))[1]
+    )
+    sphere_model(config).losses(sphere_batch(spread=0.3), Stage.MATERIAL_INIT)
     ((one, other),) = estimates
     assert len(one) > 40
-    assert (one != other).any(-1).all()
-    assert queries["light"] == len(one) * config.shading.train_samples
+    assert (one != other).any(-1).all() != is_free
+    assert sum(counts) == config.shading.train_samples
+    assert len(counts) == (1 if is_free else 2)
 
 
 def test_a_batch_without_a_hit_trains_the_remaining_fields():

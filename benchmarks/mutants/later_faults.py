@@ -204,8 +204,8 @@ LATER_FAULTS: Sequence[Mutant] = (
     Mutant(
         "both estimates of the shading have the same directions",
         "model.py",
-        "halves = [self._incident(position, normal, wo, material, count) for _ in range(2)]",
-        "halves = [self._incident(position, normal, wo, material, count)] * 2",
+        "halves = [self._incident(position, normal, wo, material, count) for _ in range(parts)]",
+        "halves = [self._incident(position, normal, wo, material, count)] * parts",
         "test_model.py",
     ),
 )

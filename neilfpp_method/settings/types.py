@@ -284,7 +284,7 @@ class ShadingConfig:
     The light is sampled if it is an environment map; otherwise cosine takes its place.
     """
     train_samples: int = 128
-    """Incident directions per surface point in training: half of them for either estimate of L_phys."""
+    """Incident directions per surface point in training; under a solved light, half for either estimate."""
     eval_samples: int = 256
     """Incident directions per surface point in evaluation."""
     hit_share: float = 0.8
