@@ -67,10 +67,11 @@ def physical(
     """L_phys: L1 distance between the pixel and a radiance of which there are two independent estimates.
 
     The expected absolute error of an estimate grows with its noise, so its minimum is at materials that are
-    rendered with little noise: polished metal becomes a mirror. Here each estimate gets its gradient with the
-    sign of the error of the other one, so that the gradient of the noise has the expectation 0. This is the
-    dual buffer of Deng et al. (2022, "Reconstructing Translucent Objects Using Differentiable Rendering"),
-    for the absolute error.
+    rendered with little noise. Here each estimate gets its gradient with the sign of the error of the other
+    one, so that the gradient of the noise has the expectation 0. This is the dual buffer of Deng et al.
+    (2022, "Reconstructing Translucent Objects Using Differentiable Rendering"), for the absolute error. Its
+    minimum is where the median of an estimate is the pixel, which under skewed noise is not the mean
+    (docs/stability.md).
 
     Args:
         one, other: linear radiance, estimated from independent samples of the incident light. If both are the

@@ -287,7 +287,7 @@ def test_a_plateau_beside_a_steep_surface_is_not_skipped_up_to_the_surface(steep
 
 
 def test_a_steep_field_elsewhere_does_not_matter():
-    """Learned fields are steep in some places, mostly deep inside or behind what cameras see."""
+    """Learned fields are steep in some places."""
 
     def steep_inside(x):
         distance = sphere_distance(x)
