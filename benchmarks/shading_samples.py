@@ -15,7 +15,7 @@ what training can find out about it. The other samplers do not depend on the lig
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -75,17 +75,17 @@ class Scene:
     light: TrueLight
     map: EnvironmentLight
 
+    def with_roughness(self, roughness: float) -> Material:
+        """The material with another roughness, the same at all points."""
+        return replace(self.material, roughness=torch.full_like(self.material.roughness, roughness))
+
     def shade(self, roughness: float, samples: IncidentSamples) -> Float[Tensor, "M 3"]:
         """Estimate of the outgoing radiance of a surface with this roughness."""
-        even = torch.full_like(self.material.roughness, roughness)
-        material = Material(self.material.base_color, even, self.material.metallic)
-        return shade(
-            material, self.normal, self.wo, Incident.of(samples, self.light.radiance(samples.wi)), LOBE
-        ).color
+        incident = Incident.of(samples, self.light.radiance(samples.wi))
+        return shade(self.with_roughness(roughness), self.normal, self.wo, incident, LOBE).color
 
     def lobe(self, roughness: float) -> Technique:
-        even = torch.full_like(self.material.roughness, roughness)
-        return specular_lobe(self.normal, self.wo, even, LOBE)
+        return specular_lobe(self.normal, self.wo, self.with_roughness(roughness).roughness, LOBE)
 
     def to_light(self) -> Technique:
         """Sampling of the map times the cosine."""
@@ -122,15 +122,12 @@ def techniques() -> dict[str, Draw]:
             Sampling(kind, count, LOBE, stochastic=True),
             scene.normal,
             scene.wo,
-            torch.full_like(scene.material.roughness, roughness),
+            scene.with_roughness(roughness),
         )
 
     def with_light(scene: Scene, roughness: float, count: int) -> IncidentSamples:
-        even = torch.full_like(scene.material.roughness, roughness)
-        light = scene.to_light()
-        return sample_directions(
-            Sampling("mis", count, LOBE, stochastic=True), scene.normal, scene.wo, even, light
-        )
+        sampling, material = Sampling("mis", count, LOBE, stochastic=True), scene.with_roughness(roughness)
+        return sample_directions(sampling, scene.normal, scene.wo, material, scene.to_light())
 
     return {kind: plain(kind) for kind in ("fibonacci", "cosine", "lobe", "mis")} | {
         "mis, light: map": with_light

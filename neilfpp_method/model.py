@@ -274,8 +274,8 @@ class NeilfModel(nn.Module):
     ) -> Incident:
         """Incident light along `samples` directions per point; no gradient flows through their choice."""
         sampling = Sampling(self.config.shading.sampler, samples, self.lobe, stochastic=self.training)
-        n, roughness = normal.detach(), material.roughness.detach()
-        drawn = sample_directions(sampling, n, wo, roughness, self.light.technique(n))
+        n = normal.detach()
+        drawn = sample_directions(sampling, n, wo, material.detach(), self.light.technique(n))
         return arriving(self.sources, position, drawn)
 
     @timed("tracing")

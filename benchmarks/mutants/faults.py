@@ -244,15 +244,15 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "pdf of the map without solid angles",
         "fields/map_sampling.py",
-        "(share / cells.solid_angle)[texel]",
-        "share[texel]",
+        "share / solid_angle / power",
+        "share / power",
         "fields/test_map_sampling.py",
     ),
     Mutant(
         "the map is sampled without the cosine",
         "fields/map_sampling.py",
-        "power * cosine.clamp_min(0)",
-        "power * torch.ones_like(cosine)",
+        "probability = power * weight",
+        "probability = power * torch.ones_like(weight)",
         "fields/test_map_sampling.py",
     ),
     Mutant(

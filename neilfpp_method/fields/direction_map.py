@@ -21,14 +21,17 @@ __all__ = [
     "directions_within",
     "grid_position",
     "interpolate",
+    "interpolation_solid_angles",
     "interpolation_weights",
     "map_directions",
+    "polar_cosines",
     "row_solid_angles",
     "texel_at",
     "texel_centers",
     "texel_means",
     "texel_solid_angles",
     "texels_of",
+    "weights_linear_in_cosine",
 ]
 
 NEIGHBOR_WEIGHT, TEXEL_WEIGHT = 1 / 8, 3 / 4
@@ -50,13 +53,57 @@ def interpolation_weights(
 ) -> tuple[Int[Tensor, "4 N S"], Float[Tensor, "4 N S"]]:
     """The four texels, row by row, between which `interpolate` interpolates, and their weights."""
     column, row = _columns_and_rows(wi, height, width)
-    left, top = column.floor(), row.floor().clamp(0, max(height - 2, 0))
-    across, down = column - left, row - top
+    top = row.floor().clamp(0, max(height - 2, 0))
+    return _four_texels(column, top, row - top, height, width)
+
+
+def weights_linear_in_cosine(
+    wi: Float[Tensor, "N S 3"], height: int, width: int
+) -> tuple[Int[Tensor, "4 N S"], Float[Tensor, "4 N S"]]:
+    """As `interpolation_weights`, but linear in the cosine of the polar angle. The map has at least two rows.
+
+    The weight of a texel has a closed integral over solid angle (`interpolation_solid_angles`).
+    """
+    column, row = _columns_and_rows(wi, height, width)
+    top = row.floor().clamp(0, height - 2)
+    cosines = polar_cosines(height, wi.device).to(wi.dtype)
+    above, below = cosines[top.long()], cosines[top.long() + 1]
+    # A direction on a row may be rounded to the other side of it.
+    down = ((above - wi[..., 2]) / (above - below)).clamp(0, 1)
+    return _four_texels(column, top, down, height, width)
+
+
+def _four_texels(
+    column: Float[Tensor, "N S"],
+    top: Float[Tensor, "N S"],
+    down: Float[Tensor, "N S"],
+    height: int,
+    width: int,
+) -> tuple[Int[Tensor, "4 N S"], Float[Tensor, "4 N S"]]:
+    """Texels and weights of a bilinear interpolation `down` from the row `top`, at a position in columns."""
+    left = column.floor()
+    across = column - left
     columns = torch.stack((left.long() % width, (left.long() + 1) % width))
     rows = torch.stack((top.long(), (top.long() + 1).clamp_max(height - 1)))
     texel = rows[:, None] * width + columns[None]
     weight = torch.stack((1 - down, down))[:, None] * torch.stack((1 - across, across))[None]
     return texel.flatten(0, 1), weight.flatten(0, 1)
+
+
+def interpolation_solid_angles(
+    height: int, width: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, " T"]:
+    """Integrals of the weights of `weights_linear_in_cosine` over all directions, in sr; their sum is 4π."""
+    cosines = polar_cosines(height, device)
+    above, below = torch.cat((cosines[:1], cosines[:-1])), torch.cat((cosines[1:], cosines[-1:]))
+    return ((above - below) / 2 * 2 * math.pi / width)[:, None].expand(-1, width).reshape(-1)
+
+
+@functools.lru_cache(maxsize=16)
+@torch.inference_mode(False)
+def polar_cosines(height: int, device: torch.device | str = "cpu") -> Float[Tensor, " H"]:
+    """Cosine of the angle from +z of each row of a map, 1 to −1. The result is kept: do not change it."""
+    return (torch.arange(height, dtype=torch.float64) * math.pi / (height - 1)).cos().float().to(device)
 
 
 def texels_of(wi: Float[Tensor, "*B 3"], height: int, width: int) -> Int[Tensor, "*B"]:

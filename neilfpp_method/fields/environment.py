@@ -18,7 +18,6 @@ from neilfpp_method.fields.direction_map import (
     directions_within,
     interpolate,
     map_directions,
-    texel_means,
     texel_solid_angles,
 )
 from neilfpp_method.fields.map_sampling import radiance_times_cosine
@@ -124,7 +123,7 @@ class EnvironmentLight(nn.Module):
 
         None for an even light.
         """
-        return None if self.even else radiance_times_cosine(self._texel_shares(), normal)
+        return None if self.even else radiance_times_cosine(self._density(), normal)
 
     @torch.no_grad()
     def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
@@ -144,15 +143,11 @@ class EnvironmentLight(nn.Module):
         return texel_solid_angles(height, width, self.log_radiance.device).to(self.log_radiance.dtype)
 
     @torch.no_grad()
-    def _texel_shares(self) -> Float[Tensor, "H W"]:
-        """Share of each texel in all light: its mean interpolated radiance times its solid angle.
-
-        The interpolation also brightens the neighbours of a bright texel, so their probability is higher.
-        """
-        mean = texel_means(luminance(self.log_radiance.permute(1, 2, 0).exp()))
-        solid_angle = self._texel_solid_angles().view_as(mean)
-        power = mean * solid_angle
-        return (1 - UNIFORM_SHARE) * power / power.sum() + UNIFORM_SHARE * solid_angle / (4 * math.pi)
+    def _density(self) -> Float[Tensor, "H W"]:
+        """Luminance of the texels relative to the mean, mixed with a constant."""
+        brightness = luminance(self.log_radiance.permute(1, 2, 0).exp())
+        mean = (brightness.flatten() @ self._texel_solid_angles()) / (4 * math.pi)
+        return (1 - UNIFORM_SHARE) * brightness / mean + UNIFORM_SHARE
 
 
 def _take_size(light: EnvironmentLight, state: Mapping[str, Any], prefix: str, *_: object) -> None:

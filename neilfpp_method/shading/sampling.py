@@ -1,8 +1,8 @@
 """Samplers of incident directions, with their densities.
 
 Every sampler integrates the same integral: the mean over S of f(wi)/pdf(wi) estimates ∫ f dwi over the
-hemisphere about n. A `Technique` maps a lattice of the unit square to directions; techniques differ in the
-density, and `combine` combines several by the balance heuristic. With `stochastic` each point's lattice is
+hemisphere about n. A `Technique` maps a `Lattice` of the unit cube to directions; techniques differ in the
+density; `combine` and `mix` combine them by the balance heuristic. With `stochastic` each point's lattice is
 rotated at random and each sample is uniform in its stratum, so that the estimate is unbiased. Without it the
 samples are at the midpoints of the strata, the same at every call.
 
@@ -22,10 +22,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.errors import UserError
-from neilfpp_method.shading.brdf import Lobe, cosines
+from neilfpp_method.shading.brdf import Lobe, cosines, diffuse_reflectance, normal_reflectance
 from neilfpp_method.shading.frame import at_least_float32, dot, local_frame
-from neilfpp_method.stratified.intervals import strata
-from neilfpp_method.structures import IncidentSamples
+from neilfpp_method.structures import IncidentSamples, Material
 
 __all__ = [
     "Sampling",
@@ -44,8 +43,11 @@ __all__ = [
 GOLDEN_TURN = (3 - math.sqrt(5)) / 2
 """The golden angle as a share of a full turn."""
 
-LOBE_SHARE = 0.25
-"""Share of the directions of "mis" for the lobe if the light can be sampled, which has the rest
+LOBE_SHARES = (0.25, 0.75)
+"""Share of the directions of "mis" for the lobe of diffuse surfaces, and of mirrors; the light has the rest.
+
+The noise of colours alone would be least with 1/16 and 15/16. But with few directions in the lobe of paint
+the derivative in roughness is noisy, and with few to the light that of metal in metallic
 (docs/performance.md).
 """
 
@@ -54,30 +56,57 @@ WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
 
 
 @dataclass(frozen=True)
+class Lattice:
+    """S points of the unit cube for each of N surface points.
+
+    Attributes:
+        u: one in each of S strata.
+        v: a Fibonacci lattice together with `u`: it advances by the golden angle.
+        w: independent of both; ½ if the lattice is not random.
+    """
+
+    u: Float[Tensor, "N S"]
+    v: Float[Tensor, "N S"]
+    w: Float[Tensor, "N S"]
+
+    @staticmethod
+    def of(index: Float[Tensor, "N S"], count: Float[Tensor, "#N #S"] | int, stochastic: bool) -> Lattice:
+        """The points of these indices in lattices of `count` points.
+
+        Args:
+            index: whole numbers from 0 to below `count`.
+            count: size of the lattice to which each point belongs.
+            stochastic: whether points are random in their strata, and lattices rotated.
+        """
+        if stochastic:
+            within, w = torch.rand(2, *index.shape).to(index)
+            shift = torch.rand_like(index[:, :1])
+        else:
+            within = w = shift = torch.full_like(index, 0.5)
+        return Lattice((index + within) / count, (index * GOLDEN_TURN + shift).frac(), w)
+
+
+@dataclass(frozen=True)
 class Technique:
     """A way to sample directions at N points.
 
     Attributes:
-        draw: `draw(count, stochastic)` returns (N, count, 3) unit directions.
+        normal: unit normals of the points.
+        place: maps a lattice to unit directions (N, S, 3).
         pdf: returns the density (N, S) of any directions (N, S, 3), per steradian.
     """
 
-    draw: Callable[[int, bool], Float[Tensor, "N S 3"]]
+    normal: Float[Tensor, "N 3"]
+    place: Callable[[Lattice], Float[Tensor, "N S 3"]]
     pdf: Callable[[Float[Tensor, "N S 3"]], Float[Tensor, "N S"]]
 
-
-@dataclass(frozen=True)
-class _Lattice:
-    """A Fibonacci lattice of [0, 1)²: one `u` in each of S strata, `v` advances by the golden angle."""
-
-    u: Float[Tensor, "N S"]
-    v: Float[Tensor, "N S"]
+    def draw(self, count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
+        """Draw `count` directions per point."""
+        return self.place(Lattice.of(_indices(self.normal, count), count, stochastic))
 
 
-def _lattice(n: Float[Tensor, "N 3"], count: int, stochastic: bool) -> _Lattice:
-    k = torch.arange(count, device=n.device, dtype=n.dtype).expand(len(n), count)
-    shift = torch.rand_like(n[:, :1]) if stochastic else 0.0
-    return _Lattice(strata(n, count, stochastic), (k * GOLDEN_TURN + shift).frac())
+def _indices(normal: Float[Tensor, "N 3"], count: int) -> Float[Tensor, "N {count}"]:
+    return torch.arange(count, device=normal.device, dtype=normal.dtype).expand(len(normal), count)
 
 
 def _about(
@@ -135,12 +164,7 @@ def _hemisphere(
 ) -> Technique:
     """Directions about n whose cosine is `height` of a uniform number, with a uniform azimuth."""
     n = at_least_float32(n)
-
-    def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
-        lattice = _lattice(n, count, stochastic)
-        return _about(n, height(lattice.u), lattice.v)
-
-    return Technique(draw, lambda wi: pdf(wi, n))
+    return Technique(n, lambda at: _about(n, height(at.u), at.v), lambda wi: pdf(wi, n))
 
 
 def specular_lobe(
@@ -149,12 +173,11 @@ def specular_lobe(
     """Mirror directions of wo about half vectors sampled from the lobe; some are below the horizon."""
     n, wo = at_least_float32(n), at_least_float32(wo)
 
-    def draw(count: int, stochastic: bool) -> Float[Tensor, "N S 3"]:
-        lattice = _lattice(n, count, stochastic)
-        h = _about(n, lobe.sample_cos_h(lattice.u, roughness), lattice.v)
+    def place(at: Lattice) -> Float[Tensor, "N S 3"]:
+        h = _about(n, lobe.sample_cos_h(at.u, roughness), at.v)
         return 2 * dot(h, wo).unsqueeze(-1) * h - wo.unsqueeze(1)
 
-    return Technique(draw, lambda wi: pdf_specular_lobe(wi, n, wo, roughness, lobe))
+    return Technique(n, place, lambda wi: pdf_specular_lobe(wi, n, wo, roughness, lobe))
 
 
 # --------------------------------------------------------------------------------------------------- samplers
@@ -172,10 +195,41 @@ def combine(techniques: Sequence[tuple[Technique, int]], stochastic: bool) -> In
     return IncidentSamples(wi, pdf)
 
 
+@torch.no_grad()
+def mix(
+    first: Technique,
+    second: Technique,
+    of_second: Float[Tensor, "N 1"],
+    count: int,
+    stochastic: bool,
+) -> IncidentSamples:
+    """Sample `count` directions, of which each point has its own share from the second technique.
+
+    The two are combined by the balance heuristic. Each has at least one direction, if there are two.
+
+    Args:
+        first, second: the techniques.
+        of_second: share of the directions that the second technique draws, 0 to 1.
+        count: directions per point.
+        stochastic: whether the directions are random.
+    """
+    index = _indices(first.normal, count)
+    by_second = (of_second.to(index) * count).round().clamp(min(1, count - 1), count - 1)
+    is_second = index < by_second
+    lattice = Lattice.of(
+        torch.where(is_second, index, index - by_second),
+        torch.where(is_second, by_second, count - by_second),
+        stochastic,
+    )
+    wi = torch.where(is_second.unsqueeze(-1), second.place(lattice), first.place(lattice))
+    weight = by_second / count
+    return IncidentSamples(wi, first.pdf(wi) * (1 - weight) + second.pdf(wi) * weight)
+
+
 def sphere_lattice(count: int, like: Tensor) -> Float[Tensor, "S 3"]:
     """`count` evenly spread directions of the sphere, on the device of `like`, in at least float32."""
     up = at_least_float32(like).new_tensor([[0.0, 0.0, 1.0]])
-    lattice = _lattice(up, count, stochastic=False)
+    lattice = Lattice.of(_indices(up, count), count, stochastic=False)
     return _about(up, 1 - 2 * lattice.u, lattice.v)[0]
 
 
@@ -185,7 +239,8 @@ class Sampling:
 
     Attributes:
         kind: the sampler. "fibonacci", "cosine" and "lobe" are one technique; "mis" is half cosine and half
-            lobe, or the light and the lobe if the light can be sampled; "no_lobe" is the light or the cosine.
+            lobe, or, if the light can be sampled, the light and the lobe in shares by material
+            (`lobe_share`); "no_lobe" is the light or the cosine.
         count: directions per point.
         lobe: the specular lobe; None for Lambertian surfaces, for which "mis" is "no_lobe" and "lobe" is
             "cosine".
@@ -202,7 +257,7 @@ def sample_directions(
     sampling: Sampling,
     n: Float[Tensor, "N 3"],
     wo: Float[Tensor, "N 3"],
-    roughness: Float[Tensor, "N 1"],
+    material: Material,
     light: Technique | None = None,
 ) -> IncidentSamples:
     """Sample incident directions at N points, in at least float32.
@@ -210,7 +265,7 @@ def sample_directions(
     Args:
         sampling: the sampler and the number of directions.
         n, wo: unit normals, and unit directions to the viewer.
-        roughness: roughness of the surface.
+        material: material of the surface.
         light: samples the light times the cosine; None if the light cannot be sampled.
 
     Raises:
@@ -224,12 +279,29 @@ def sample_directions(
     elif kind == "cosine":
         techniques = [(cosine(n), count)]
     elif kind == "lobe":
-        techniques = [(specular_lobe(n, wo, roughness, lobe), count)]
+        techniques = [(specular_lobe(n, wo, material.roughness, lobe), count)]
+    elif kind == "mis" and light is None:
+        by_lobe = specular_lobe(n, wo, material.roughness, lobe)
+        techniques = [(cosine(n), count - count // 2), (by_lobe, count // 2)]
     elif kind == "mis":
-        to_lobe = count // 2 if light is None else int(LOBE_SHARE * count)
-        techniques = [(light or cosine(n), count - to_lobe), (specular_lobe(n, wo, roughness, lobe), to_lobe)]
+        by_lobe = specular_lobe(n, wo, material.roughness, lobe)
+        return mix(light, by_lobe, lobe_share(material), count, sampling.stochastic)
     elif kind == "no_lobe":
         techniques = [(light or cosine(n), count)]
     else:
         raise UserError(f"unknown sampler '{kind}'", "choose fibonacci, cosine, lobe, mis or no_lobe")
     return combine(techniques, sampling.stochastic)
+
+
+def lobe_share(material: Material) -> Float[Tensor, "N 1"]:
+    """Share of the directions for the lobe beside directions to the light, within `LOBE_SHARES`.
+
+    It grows with the specular share of the reflectance at normal incidence, and is smaller for rough
+    surfaces, of which the light's directions sample the whole reflection well.
+    """
+    specular, diffuse = (
+        part(material).mean(-1, keepdim=True) for part in (normal_reflectance, diffuse_reflectance)
+    )
+    least, most = LOBE_SHARES
+    glossy = specular / (specular + diffuse).clamp_min(1e-6) * (1 - material.roughness.square())
+    return least + (most - least) * glossy

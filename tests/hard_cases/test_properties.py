@@ -152,7 +152,8 @@ def test_samplers_draw_unit_directions_of_finite_density(
 ):
     n, wo = direction(normals, dtype), direction(to_viewer, dtype)
     roughness = torch.from_numpy(rough).to(dtype)
-    drawn = sample_directions(Sampling(kind, count, GGX, stochastic=moves), n, wo, roughness)
+    material = Material(roughness.expand(-1, 3), roughness, roughness)
+    drawn = sample_directions(Sampling(kind, count, GGX, stochastic=moves), n, wo, material)
     assert drawn.wi.shape == (ROWS, count, 3)
     # Normals of half precision are themselves off unit length by half a unit in the last place.
     assert (drawn.wi.norm(dim=-1) - 1).abs().max() < max(1e-5, 8 * torch.finfo(dtype).eps)

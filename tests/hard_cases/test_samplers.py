@@ -9,11 +9,11 @@ import pytest
 import torch
 from scipy import stats
 
-from neilfpp_method.fields.direction_map import texels_of
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading import Sampling, sample_directions
 from neilfpp_method.shading.brdf import LOBES
 from tests import oracles
+from tests.fields.test_map_sampling import between_texels, counts
 from tests.hard_cases.known_ball import sky
 from tests.shading.test_sampling import NORMALS, density, points
 
@@ -52,18 +52,17 @@ def test_a_million_directions(kind, lobe, view):
 
 @pytest.mark.hard
 def test_a_million_directions_of_a_map():
-    """The cells are the texels of the map, on each of which the density is constant."""
+    """Between two rows and two columns of the map, where the density is bilinear."""
     torch.manual_seed(12)
     light = EnvironmentLight(16, 1.0)
     light.show(torch.from_numpy(sky()).float().permute(2, 0, 1))
     normal = torch.tensor([NORMALS["oblique"]]).float()
-    middle = light.texel_directions(normal)
-    share = (light.technique(normal).pdf(middle.wi)[0] * middle.solid_angle).double().numpy()
+    share = between_texels(light.technique(normal), 16, 32).flatten()
     assert share.sum() == pytest.approx(1, abs=1e-4)
     drawn = torch.cat(
         [light.technique(part).draw(1, True) for part in normal.expand(SAMPLES, 3).split(100_000)]
     )
-    counted = np.bincount(texels_of(drawn, 16, 32).reshape(-1).numpy(), minlength=512)
+    counted = counts(drawn, 16, 32)
     expected = share / share.sum() * counted.sum()
     rare = expected < 5
     counted = np.append(counted[~rare], counted[rare].sum())

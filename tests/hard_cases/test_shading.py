@@ -109,9 +109,7 @@ def test_a_pdf_of_zero_causes_no_division_by_zero(lobe, dtype):
 def test_sampled_directions_and_their_estimate_are_bounded(kind, lobe, dtype):
     torch.manual_seed(0)
     leaf, material, wo, _ = hard_scene(dtype)
-    samples = sample_directions(
-        Sampling(kind, 64, LOBES[lobe], stochastic=True), leaf["n"], wo, material.roughness
-    )
+    samples = sample_directions(Sampling(kind, 64, LOBES[lobe], stochastic=True), leaf["n"], wo, material)
     assert samples.pdf.isfinite().all()
     assert samples.pdf.ge(0).all()
     assert (samples.wi.norm(dim=-1) - 1).abs().max() < (0.02 if dtype == torch.bfloat16 else 1e-5)
@@ -133,7 +131,7 @@ def test_importance_samples_of_a_mirror_cause_no_fireflies(kind, lobe):
     r = torch.tensor([[1e-4], [0.05], [0.1]])
     n, wo = torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3), torch.tensor([[0.6, 0.0, 0.8]]).expand(3, 3)
     material = Material(torch.ones(3, 3), r, torch.ones(3, 1))
-    samples = sample_directions(Sampling(kind, 4096, LOBES[lobe], stochastic=True), n, wo, r)
+    samples = sample_directions(Sampling(kind, 4096, LOBES[lobe], stochastic=True), n, wo, material)
     single = IncidentSamples(samples.wi.reshape(-1, 1, 3), samples.pdf.reshape(-1, 1))
     many = Material(*(t.repeat_interleave(4096, 0) for t in (material.base_color, r, material.metallic)))
     light = torch.ones_like(single.wi)

@@ -62,9 +62,7 @@ def test_transport_agrees_with_the_estimator_under_a_map_and_a_wall():
     radiance = environment.log_radiance.exp().flatten(1).t()
     carried = sum(one.outgoing(of, radiance) for one in several) / len(several)
 
-    drawn = sample_directions(
-        Sampling("mis", 16_384, GGX, stochastic=True), seen.normal, seen.wo, of.roughness
-    )
+    drawn = sample_directions(Sampling("mis", 16_384, GGX, stochastic=True), seen.normal, seen.wo, of)
     arriving = environment.radiance(seen.position, drawn.wi)
     arriving = torch.where(drawn.wi[..., 2:] < 0, 0.7, arriving)
     expected = shade(of, seen.normal, seen.wo, Incident.of(drawn, arriving), GGX).color

@@ -43,7 +43,7 @@ def test_what_a_mirror_like_metal_reflects_has_little_noise(roughness):
     torch.manual_seed(0)
     environment, seen = sky(), points(COUNT)
     of = Material(torch.full((COUNT, 3), 0.8), torch.full((COUNT, 1), roughness), torch.ones(COUNT, 1))
-    drawn = sample_directions(Sampling("mis", 16_384, GGX, True), seen.normal, seen.wo, of.roughness)
+    drawn = sample_directions(Sampling("mis", 16_384, GGX, True), seen.normal, seen.wo, of)
     radiance = environment.radiance(seen.position, drawn.wi)
     radiance = torch.where(drawn.wi[..., 2:] < 0, 0.7, radiance)
     expected = shade(of, seen.normal, seen.wo, Incident.of(drawn, radiance), GGX).color

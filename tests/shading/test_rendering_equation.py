@@ -100,7 +100,7 @@ def test_every_sampler_estimates_the_same_integral(kind, lobe, r, m, truth):
     count = 4000
     material = Material(rows(B, count), rows([r], count), rows([m], count))
     n, wo = rows((0.0, 0.0, 1.0), count), rows(WO, count)
-    samples = sample_directions(Sampling(kind, 32, LOBES[lobe], stochastic=True), n, wo, material.roughness)
+    samples = sample_directions(Sampling(kind, 32, LOBES[lobe], stochastic=True), n, wo, material)
     light = sky(samples.wi)[..., None].expand_as(samples.wi)
     estimates = shade(material, n, wo, Incident.of(samples, light), LOBES[lobe]).color[:, 0]
     error = estimates.std().item() / count**0.5
@@ -114,9 +114,7 @@ def test_midpoint_lattices_converge(lobe, truth):
     material = Material(rows(B, 1), rows([r], 1), rows([m], 1))
     n, wo = rows((0.0, 0.0, 1.0), 1), rows(WO, 1)
     for kind in ("fibonacci", "cosine", "mis"):
-        samples = sample_directions(
-            Sampling(kind, 4096, LOBES[lobe], stochastic=False), n, wo, material.roughness
-        )
+        samples = sample_directions(Sampling(kind, 4096, LOBES[lobe], stochastic=False), n, wo, material)
         light = sky(samples.wi)[..., None].expand_as(samples.wi)
         color = shade(material, n, wo, Incident.of(samples, light), LOBES[lobe]).color[0, 0].item()
         assert color == pytest.approx(truth[lobe, r, m], rel=2e-3)
@@ -131,7 +129,7 @@ def test_specular_furnace_of_a_smooth_metal():
     material = Material(rows((1.0, 1.0, 1.0), count), rows([0.2], count), rows([1.0], count))
     n = rows((0.0, 0.0, 1.0), count)
     for lobe in (SPHERICAL_GAUSSIAN, GGX):
-        samples = sample_directions(Sampling("lobe", 64, lobe, stochastic=True), n, n, material.roughness)
+        samples = sample_directions(Sampling("lobe", 64, lobe, stochastic=True), n, n, material)
         color = shade(material, n, n, Incident.of(samples, torch.ones_like(samples.wi)), lobe).color
         assert color.mean().item() == pytest.approx(1, abs=0.01)
 
@@ -155,11 +153,10 @@ def test_gradient_of_the_estimate_is_the_gradient_of_the_integral(truth):
     count, r, step = 4000, 0.6, 1e-2
     n, wo = rows((0.0, 0.0, 1.0), count), rows(WO, count)
     roughness = rows([r], count).clone().requires_grad_()
-    samples = sample_directions(Sampling("lobe", 32, GGX, stochastic=True), n, wo, roughness)
+    material = Material(rows(B, count), roughness, rows([M], count))
+    samples = sample_directions(Sampling("lobe", 32, GGX, stochastic=True), n, wo, material)
     light = sky(samples.wi)[..., None].expand_as(samples.wi)
-    specular = shade(
-        Material(rows(B, count), roughness, rows([M], count)), n, wo, Incident.of(samples, light), GGX
-    ).specular[:, 0]
+    specular = shade(material, n, wo, Incident.of(samples, light), GGX).specular[:, 0]
     (gradient,) = torch.autograd.grad(specular.sum(), roughness)
 
     def integral(r: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from neilfpp_method.shading.sampling import (
     sample_directions,
     sphere_lattice,
 )
+from neilfpp_method.structures import Material
 from tests import oracles
 
 KINDS = ("fibonacci", "cosine", "lobe", "mis")
@@ -30,11 +32,15 @@ NORMALS = {"frontal": (0.0, 0.0, 1.0), "oblique": (0.8, 0.0, 0.6), "grazing": (0
 POINTS, PER_POINT = 20_000, 6
 
 
-def points(n, wo, count: int, roughness: float = 0.5, dtype=torch.float64):
-    return tuple(torch.tensor([v], dtype=dtype).expand(count, -1) for v in (n, wo, (roughness,)))
+def points(n, wo, count: int, roughness: float = 0.5, metallic: float = 0.0):
+    """Normals, directions to the viewer, and a grey material."""
+    made_of = ((0.5, 0.5, 0.5), (roughness,), (metallic,))
+    n, wo, *made_of = (torch.tensor([v], dtype=torch.float64).expand(count, -1) for v in (n, wo, *made_of))
+    return n, wo, Material(*made_of)
 
 
-def density(kind, lobe, wi, n, wo, r):
+def density(kind, lobe, wi, n, wo, material):
+    r = material.roughness
     return {
         "fibonacci": lambda: sampling.pdf_fibonacci(wi, n),
         "cosine": lambda: sampling.pdf_cosine(wi, n),
@@ -67,9 +73,9 @@ def test_chi2(kind, lobe, r, view):
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_reported_pdf_is_the_density_at_the_directions(kind):
     torch.manual_seed(4)
-    n, wo, r = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 5)
-    samples = sample_directions(Sampling(kind, 16, GGX, stochastic=True), n, wo, r)
-    assert torch.equal(samples.pdf, density(kind, GGX, samples.wi, n, wo, r))
+    n, wo, material = points((0.6, 0.0, 0.8), (0.0, 0.6, 0.8), 5)
+    samples = sample_directions(Sampling(kind, 16, GGX, stochastic=True), n, wo, material)
+    assert torch.equal(samples.pdf, density(kind, GGX, samples.wi, n, wo, material))
     assert samples.wi.norm(dim=-1).allclose(torch.ones(5, 16, dtype=torch.float64))
 
 
@@ -99,18 +105,21 @@ def test_fibonacci_lies_at_cell_midpoints():
 def test_mis_is_unbiased_for_odd_counts(count):
     """The mean of (n·wi)/pdf estimates ∫ n·wi dwi = π; with one sample the mixture has only the cosine."""
     torch.manual_seed(6)
-    n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
-    samples = sample_directions(Sampling("mis", count, SPHERICAL_GAUSSIAN, stochastic=True), n, wo, r)
+    n, wo, material = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 20_000)
+    samples = sample_directions(Sampling("mis", count, SPHERICAL_GAUSSIAN, stochastic=True), n, wo, material)
     assert samples.pdf.shape == (20_000, count)
     estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
     assert estimate == pytest.approx(math.pi, rel=5e-3)
 
 
 def test_samples_carry_no_gradient():
-    n, wo, r = (t.clone().requires_grad_() for t in points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 2))
-    samples = sample_directions(Sampling("mis", 8, GGX, stochastic=True), n, wo, r)
-    assert not samples.wi.requires_grad
-    assert not samples.pdf.requires_grad
+    n, wo, material = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 2)
+    n, wo, roughness = (t.clone().requires_grad_() for t in (n, wo, material.roughness))
+    material = replace(material, roughness=roughness)
+    for light in (None, light_of(n)):
+        samples = sample_directions(Sampling("mis", 8, GGX, stochastic=True), n, wo, material, light)
+        assert not samples.wi.requires_grad
+        assert not samples.pdf.requires_grad
 
 
 def test_an_unknown_sampler_is_refused():
@@ -124,8 +133,8 @@ def test_an_unknown_sampler_is_refused():
 def light_of(n):
     """Light from z > 0, 80 % of it at azimuths from 270° to 360°, whose edges are edges of the χ² cells."""
 
-    def draw(count, stochastic):
-        z, turn, choice = torch.rand(3, len(n), count, dtype=n.dtype)
+    def place(at):
+        z, turn, choice = at.u, at.v, at.w
         azimuth = torch.where(choice < 0.8, math.pi * (1.5 + 0.5 * turn), 1.5 * math.pi * turn)
         sine = (1 - z * z).sqrt()
         return torch.stack((sine * azimuth.cos(), sine * azimuth.sin(), z), -1)
@@ -135,31 +144,35 @@ def light_of(n):
         quarter = 2 / math.pi
         return (z > 0) * torch.where((x > 0) & (y < 0), 0.8 * quarter, 0.2 * quarter / 3)
 
-    return Technique(draw, pdf)
+    return Technique(n, place, pdf)
 
 
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
 @pytest.mark.parametrize("count", [1, 2, 3, 8, 9])
-def test_mis_with_light_estimates_the_same_integral(count):
+def test_mis_with_light_estimates_the_same_integral(count, metallic):
     torch.manual_seed(7)
-    n, wo, r = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 100_000)
-    samples = sample_directions(Sampling("mis", count, GGX, stochastic=True), n, wo, r, light_of(n))
+    n, wo, material = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 100_000, metallic=metallic)
+    samples = sample_directions(Sampling("mis", count, GGX, stochastic=True), n, wo, material, light_of(n))
     assert samples.pdf.shape == (100_000, count)
     estimate = (samples.wi[..., 2].clamp_min(0) / samples.pdf).mean().item()
     assert estimate == pytest.approx(math.pi, rel=2e-2)
 
 
-def test_the_density_of_mis_with_light_is_that_of_its_directions():
+@pytest.mark.parametrize(("metallic", "to_lobe"), [(0.0, 2), (1.0, 5)])
+def test_the_density_of_mis_with_light_is_that_of_its_directions(metallic, to_lobe):
+    """8 directions of roughness 0.6: 25 % and 29 % to the lobe of paint, 57 % to that of metal."""
     torch.manual_seed(8)
-    n, wo, r = points(NORMALS["oblique"], (0.0, 0.0, 1.0), POINTS, 0.6)
-    light, one = light_of(n), (n[:1], wo[:1], r[:1])
+    n, wo, material = points(NORMALS["oblique"], (0.0, 0.0, 1.0), POINTS, 0.6, metallic)
+    light, one = light_of(n), (n[:1], wo[:1], material[:1])
+    share = to_lobe / 8
 
-    def pdf(wi):  # 8 directions: 6 to the light, 2 to the lobe
+    def pdf(wi):
         wi = torch.from_numpy(wi)[None]
-        return (0.75 * light.pdf(wi) + 0.25 * density("lobe", GGX, wi, *one))[0].numpy()
+        return ((1 - share) * light.pdf(wi) + share * density("lobe", GGX, wi, *one))[0].numpy()
 
     result = oracles.chi2_test(
         lambda: (
-            sample_directions(Sampling("mis", 8, GGX, stochastic=True), n, wo, r, light)
+            sample_directions(Sampling("mis", 8, GGX, stochastic=True), n, wo, material, light)
             .wi.reshape(-1, 3)
             .numpy()
         ),
@@ -167,6 +180,18 @@ def test_the_density_of_mis_with_light_is_that_of_its_directions():
     )
     assert result.passed, result
     assert result.total == pytest.approx(1, abs=1e-4)
+
+
+def test_each_point_has_its_own_share_of_directions_in_the_lobe():
+    """Of 64 directions, 16 to 48 are in the lobe: more for metal, and fewer for rough surfaces."""
+    torch.manual_seed(9)
+    n, wo, material = points((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), 4)
+    roughness, metallic = torch.tensor([[0.1, 0.1, 1.0, 0.6], [0.0, 1.0, 1.0, 1.0]]).double().unsqueeze(-1)
+    material = replace(material, roughness=roughness, metallic=metallic)
+    assert (64 * sampling.lobe_share(material)).round()[:, 0].tolist() == [18, 48, 16, 36]
+    samples = sample_directions(Sampling("mis", 64, GGX, stochastic=True), n, wo, material, light_of(n))
+    mirror = torch.tensor([-0.6, 0.0, 0.8], dtype=torch.float64)
+    assert ((samples.wi @ mirror)[:2] > 0.99).sum(1).tolist() == pytest.approx([18, 48], abs=2)
 
 
 # ------------------------------------------------------------------------------------------- the whole sphere

@@ -54,7 +54,7 @@ def lobe_noise(model: NeilfModel, places: Places, fit: PlaceFit) -> Measurement:
         colors = []
         for _ in range(SHADINGS):
             drawn = sample_directions(
-                sampling, observed.normal, observed.wo, material.roughness, light.technique(observed.normal)
+                sampling, observed.normal, observed.wo, material, light.technique(observed.normal)
             )
             arrived = arriving(sources, observed.position, drawn)
             colors.append(shade(material, observed.normal, observed.wo, arrived, lobe).color)
