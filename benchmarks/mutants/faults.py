@@ -134,11 +134,18 @@ MUTANTS: Sequence[Mutant] = (
         "shading/test_sampling.py",
     ),
     Mutant(
+        "shares of light and lobe are exchanged in their density",
+        SAMPLING,
+        "first.pdf(wi) * (1 - weight) + second.pdf(wi) * weight",
+        "first.pdf(wi) * weight + second.pdf(wi) * (1 - weight)",
+        "shading/test_sampling.py",
+    ),
+    Mutant(
         "stratified samples are always midpoints",
         "stratified/intervals.py",
         "(k + (torch.rand_like(k) if stochastic else 0.5)) / count",
         "(k + 0.5) / count",
-        "shading/test_sampling.py",
+        "stratified/test_intervals.py",
     ),
     # Density and compositing.
     Mutant(
@@ -247,6 +254,20 @@ MUTANTS: Sequence[Mutant] = (
         "share / solid_angle / power",
         "share / power",
         "fields/test_map_sampling.py",
+    ),
+    Mutant(
+        "directions of a map are uniform between texels",
+        "fields/map_sampling.py",
+        "(2 * across).sqrt() - 1, 1 - (2 * (1 - across)).sqrt()",
+        "2 * across - 1, 2 * across - 1",
+        "fields/test_map_sampling.py",
+    ),
+    Mutant(
+        "rays towards the light count twice in light fits",
+        "lighting/map_transport.py",
+        "density = density + sum(count * technique.pdf(wi) for technique, count in techniques)",
+        "density = density + 0 * sum(count * technique.pdf(wi) for technique, count in techniques)",
+        "lighting/test_fit.py",
     ),
     Mutant(
         "the map is sampled without the cosine",

@@ -19,6 +19,12 @@ from neilfpp_method.structures import Observed, SceneLight, SceneTracer
 
 __all__ = ["TexelRays", "from_texels", "trace_texels"]
 
+LIGHT_RAYS = 64
+"""Rays per point in directions that are drawn from the map itself. With one ray in each texel alone, what a
+point receives from a sun of few texels is all or nothing at the edges of shadows; such noise is smallest
+under a blurred sun, so a fit preferred one: of a true share of 30 % of all light within 3° it found 6 %, with
+these rays 10 %, and 18 % once they are drawn from the sharper map.
+"""
 LOBE_RAYS = 32
 """Rays per point in directions that are drawn from its specular lobe. The lobe of a polished surface is
 narrower than a texel: with one ray in each texel alone, the error of what a surface of roughness 0.14
@@ -36,10 +42,11 @@ def from_texels(
 ) -> Transport:
     """The transport from the texels of a map, between which radiance is interpolated, per unit of radiance.
 
-    For each point, one random direction in each texel is traced, and `LOBE_RAYS` directions of the lobe.
+    For each point, one random direction in each texel is traced, `LIGHT_RAYS` towards the light of the map,
+    and `LOBE_RAYS` in the lobe.
 
     Args:
-        environment: the map; only its shape is used, not its radiance.
+        environment: the map; its radiance only determines how rays are distributed.
         observed: the surface points, with unit normals and directions to the viewer.
         roughness: roughness at the points.
         lobe: the specular lobe; None for Lambertian surfaces.
@@ -49,10 +56,12 @@ def from_texels(
     parts = []
     for span in spans(len(observed), environment.log_radiance[0].numel()):
         part = observed[span]
-        rays = trace_texels(environment, part.position, part.normal, scene)
+        to_light = environment.technique(part.normal)
+        techniques = [] if to_light is None else [(to_light, LIGHT_RAYS)]
         if lobe is not None:
-            in_lobe = specular_lobe(part.normal, part.wo, roughness[span], lobe)
-            rays = rays.with_technique(in_lobe, LOBE_RAYS, part.position, scene)
+            techniques.append((specular_lobe(part.normal, part.wo, roughness[span], lobe), LOBE_RAYS))
+        rays = trace_texels(environment, part.position, part.normal, scene)
+        rays = rays.with_techniques(techniques, part.position, scene)
         kernel = brdf_kernel(part, roughness[span], rays.wi, rays.weight(part.normal), lobe)
         parts.append(rays.between_texels(kernel))
     return Transport.joined(parts)
@@ -60,7 +69,7 @@ def from_texels(
 
 @dataclass(frozen=True)
 class TexelRays:
-    """Rays from N points to a map: one in each texel above the horizon, and further ones (`with_technique`).
+    """Rays from N points to a map: one in each texel above the horizon, and further ones (`with_techniques`).
 
     Attributes:
         wi: their directions.
@@ -96,22 +105,27 @@ class TexelRays:
         drawn = environment.texel_directions(position)
         return replace(self, wi=drawn.wi.gather(1, self.texel[..., None].expand(-1, -1, 3)))
 
-    def with_technique(
-        self, technique: Technique, count: int, position: Float[Tensor, "N 3"], scene: SceneTracer | None
+    def with_techniques(
+        self,
+        techniques: Sequence[tuple[Technique, int]],
+        position: Float[Tensor, "N 3"],
+        scene: SceneTracer | None,
     ) -> TexelRays:
-        """These rays and `count` more that another technique draws, weighted by the balance heuristic.
+        """These rays, one in each texel, and those of other techniques, weighted by the balance heuristic.
 
         Args:
-            technique: draws the further directions.
-            count: number of further directions per point.
+            techniques: each draws that number of further directions per point.
             position: the points from which they are traced.
             scene: as in `from_texels`.
         """
-        drawn = technique.draw(count, True)
+        if not techniques:
+            return self
+        drawn = torch.cat([technique.draw(count, True) for technique, count in techniques], 1)
         texel = texels_of(drawn, *self.size)
         solid_angle = texel_solid_angles(*self.size, drawn.device).to(drawn.dtype)[texel]
         wi = torch.cat((self.wi, drawn), 1)
-        density = torch.cat((self.density, 1.0 / solid_angle), 1) + count * technique.pdf(wi)
+        density = torch.cat((self.density, 1.0 / solid_angle), 1)
+        density = density + sum(count * technique.pdf(wi) for technique, count in techniques)
         scene_light = None
         if scene is not None:
             further = scene(position, drawn)

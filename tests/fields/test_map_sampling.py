@@ -1,7 +1,7 @@
 """Sampling of a map times the cosine: densities, χ², and the noise of irradiance.
 
 Between four neighbouring texels the density is linear in the cosine of the polar angle and in the azimuth, so
-its mean there is its value in the middle.
+its mean over any cell there is its value in the middle. Cells are quarters of the areas between four texels.
 """
 
 from __future__ import annotations
@@ -39,21 +39,30 @@ def values(height: int, width: int) -> torch.Tensor:
     return radiance
 
 
-def between_texels(technique: Technique, height: int, width: int) -> np.ndarray:
-    """Probability of the direction being between two rows and two columns, by row and column."""
-    cosines = polar_cosines(height)
-    middle = (cosines[:-1] + cosines[1:])[:, None].expand(-1, width) / 2
-    azimuth = (torch.arange(width) + 1) * 2 * math.pi / width
-    pdf = technique.pdf(direction_at(middle, azimuth.expand(height - 1, -1)).view(1, -1, 3))[0]
-    return (pdf.view(height - 1, width) * -cosines.diff()[:, None] * 2 * math.pi / width).double().numpy()
+def cell_edges(height: int) -> torch.Tensor:
+    """Cosines of the polar angle of all rows, and those halfway between them, from 1 to −1; float64."""
+    rows = polar_cosines(height).double()
+    halfway = (rows[:-1] + rows[1:]) / 2
+    return torch.cat((torch.stack((rows[:-1], halfway), 1).flatten(), rows[-1:]))
+
+
+def probabilities(technique: Technique, height: int, width: int) -> np.ndarray:
+    """Probability of each cell, for one point."""
+    edges = cell_edges(height)
+    middle = ((edges[:-1] + edges[1:]) / 2)[:, None].expand(-1, 2 * width).float()
+    azimuth = (torch.arange(2 * width) + 0.5) * math.pi / width
+    wi = direction_at(middle, azimuth.expand(middle.shape))
+    pdf = technique.pdf(wi.view(1, -1, 3))[0].double().view(middle.shape)
+    return (pdf * -edges.diff()[:, None] * math.pi / width).flatten().numpy()
 
 
 def counts(wi: torch.Tensor, height: int, width: int) -> np.ndarray:
-    """Number of directions between two rows and two columns, in the order of `between_texels`."""
+    """Number of directions in each cell, in the order of `probabilities`."""
     x, y, z = wi.reshape(-1, 3).double().unbind(-1)
-    row = torch.searchsorted(-polar_cosines(height).double(), -z).clamp(1, height - 1) - 1
-    column = torch.floor(torch.atan2(x, y) / (2 * math.pi) * width - 0.5).long() % width
-    return np.bincount((row * width + column).numpy(), minlength=(height - 1) * width)
+    row = torch.searchsorted(-cell_edges(height), -z).clamp(1, 2 * height - 2) - 1
+    turn = torch.atan2(x, y) / (2 * math.pi) % 1
+    column = (turn * 2 * width).long().clamp_max(2 * width - 1)
+    return np.bincount((row * 2 * width + column).numpy(), minlength=4 * (height - 1) * width)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -82,7 +91,7 @@ def test_weights_are_those_of_the_texels_and_their_integrals_are_known(size):
 def test_the_density_is_positive_above_the_horizon_and_integrates_to_one(size, normal):
     n = torch.tensor([normal])
     technique = radiance_times_cosine(values(*size), n)
-    assert between_texels(technique, *size).sum() == pytest.approx(1, abs=1e-5)
+    assert probabilities(technique, *size).sum() == pytest.approx(1, abs=1e-5)
     above = normalize(torch.randn(1, 20_000, 3), dim=-1)
     above = above * (above @ n[0] > 0).float().mul(2).sub(1)[..., None]
     assert technique.pdf(above).min() > 0
@@ -92,13 +101,13 @@ def test_the_density_is_positive_above_the_horizon_and_integrates_to_one(size, n
 @pytest.mark.parametrize("normal", NORMALS)
 @pytest.mark.parametrize("size", SIZES)
 def test_directions_follow_the_density(size, normal, count):
-    """χ² over directions between texels; with several strata each count varies less than Poisson's, so only
+    """χ² over the cells; with several strata each count varies less than Poisson's, so only
     from above.
     """
     torch.manual_seed(1)
     n = torch.tensor([normal]).expand(160_000 // count, 3)
     counted = counts(radiance_times_cosine(values(*size), n).draw(count, True), *size)
-    expected = 160_000 * between_texels(radiance_times_cosine(values(*size), n[:1]), *size).flatten()
+    expected = 160_000 * probabilities(radiance_times_cosine(values(*size), n[:1]), *size)
     rare = expected < 5
     counted = np.append(counted[~rare], counted[rare].sum())
     expected = np.append(expected[~rare], expected[rare].sum())

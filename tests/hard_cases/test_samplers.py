@@ -13,7 +13,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.shading import Sampling, sample_directions
 from neilfpp_method.shading.brdf import LOBES
 from tests import oracles
-from tests.fields.test_map_sampling import between_texels, counts
+from tests.fields.test_map_sampling import counts, probabilities
 from tests.hard_cases.known_ball import sky
 from tests.shading.test_sampling import NORMALS, density, points
 
@@ -52,12 +52,12 @@ def test_a_million_directions(kind, lobe, view):
 
 @pytest.mark.hard
 def test_a_million_directions_of_a_map():
-    """Between two rows and two columns of the map, where the density is bilinear."""
+    """In quarters of the areas between four texels, on which the density is bilinear."""
     torch.manual_seed(12)
     light = EnvironmentLight(16, 1.0)
     light.show(torch.from_numpy(sky()).float().permute(2, 0, 1))
     normal = torch.tensor([NORMALS["oblique"]]).float()
-    share = between_texels(light.technique(normal), 16, 32).flatten()
+    share = probabilities(light.technique(normal), 16, 32)
     assert share.sum() == pytest.approx(1, abs=1e-4)
     drawn = torch.cat(
         [light.technique(part).draw(1, True) for part in normal.expand(SAMPLES, 3).split(100_000)]
