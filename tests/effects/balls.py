@@ -17,7 +17,7 @@ from neilfpp_method.shading import LOBES
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material, Observed
 
-DIRECTIONS = 8
+DIRECTIONS = 16
 """Number of directions per texel from which a pixel of the ball is computed."""
 
 
