@@ -123,7 +123,7 @@ class EnvironmentLight(nn.Module):
 
         None for an even light.
         """
-        return None if self.even else radiance_times_cosine(self._density(), normal)
+        return None if self.even else radiance_times_cosine(self._sampled_luminance(), normal)
 
     @torch.no_grad()
     def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
@@ -143,7 +143,7 @@ class EnvironmentLight(nn.Module):
         return texel_solid_angles(height, width, self.log_radiance.device).to(self.log_radiance.dtype)
 
     @torch.no_grad()
-    def _density(self) -> Float[Tensor, "H W"]:
+    def _sampled_luminance(self) -> Float[Tensor, "H W"]:
         """Luminance of the texels relative to the mean, mixed with a constant."""
         brightness = luminance(self.log_radiance.permute(1, 2, 0).exp())
         mean = (brightness.flatten() @ self._texel_solid_angles()) / (4 * math.pi)

@@ -66,11 +66,11 @@ class _Cells:
 
 
 @torch.no_grad()
-def radiance_times_cosine(density: Float[Tensor, "H W"], normal: Float[Tensor, "N 3"]) -> Technique:
+def radiance_times_cosine(luminance: Float[Tensor, "H W"], normal: Float[Tensor, "N 3"]) -> Technique:
     """Sampling in proportion to an interpolated map times the cosine about a normal.
 
     Args:
-        density: value of each texel, positive. The map between the texels is interpolated linearly in the
+        luminance: luminance of each texel up to a common factor, positive. The map between the texels is interpolated linearly in the
             azimuth and in the cosine of the polar angle. That of `direction_map.interpolate` is linear in the
             polar angle itself; the two differ by a factor of at most 2, at the poles.
         normal: unit normals.
@@ -78,12 +78,12 @@ def radiance_times_cosine(density: Float[Tensor, "H W"], normal: Float[Tensor, "
     Returns:
         The technique; its density is positive in all directions above the horizon.
     """
-    height, width = density.shape
+    height, width = luminance.shape
     normal = at_least_float32(normal)
-    values = density.reshape(-1).to(normal)
-    cells = _cells(height, width, values.device)
-    solid_angle = interpolation_solid_angles(height, width, values.device).to(normal)
-    share = values * solid_angle / (values @ solid_angle)
+    texels = luminance.reshape(-1).to(normal)
+    cells = _cells(height, width, texels.device)
+    solid_angle = interpolation_solid_angles(height, width, texels.device).to(normal)
+    share = texels * solid_angle / (texels @ solid_angle)
     power = share.new_zeros(len(cells.center)).index_add(0, cells.of_texel, share)
     cosine = normal @ cells.center.to(normal).t()
     # A cell that the horizon cuts has a positive weight, because some of its directions are above.

@@ -27,6 +27,7 @@ from neilfpp_method.shading.frame import at_least_float32, dot, local_frame
 from neilfpp_method.structures import IncidentSamples, Material
 
 __all__ = [
+    "Lattice",
     "Sampling",
     "Technique",
     "combine",
@@ -48,7 +49,7 @@ LOBE_SHARES = (0.25, 0.75)
 
 The noise of colours alone would be least with 1/16 and 15/16. But with few directions in the lobe of paint
 the derivative in roughness is noisy, and with few to the light that of metal in metallic
-(docs/performance.md).
+(docs/notebook/2026-11-29-noise-of-maps.md).
 """
 
 WITHOUT_LOBE = {"mis": "no_lobe", "lobe": "cosine"}
@@ -79,7 +80,7 @@ class Lattice:
             stochastic: whether points are random in their strata, and lattices rotated.
         """
         if stochastic:
-            within, w = torch.rand(2, *index.shape).to(index)
+            within, w = torch.rand((2, *index.shape), dtype=index.dtype, device=index.device)
             shift = torch.rand_like(index[:, :1])
         else:
             within = w = shift = torch.full_like(index, 0.5)

@@ -143,6 +143,7 @@ def test_an_even_light_has_no_look_ups_and_one_source(monkeypatch):
 
 
 def test_white_light_has_one_channel():
+    # Without lamps: they could explain the brighter side as well.
     config = Plan.begin(parse_effects("all,-coloured-light,-lamps"), solved_light(tiny_config())).config
     fit = dataclasses.replace(config.light.fit, points=200)
     config = dataclasses.replace(

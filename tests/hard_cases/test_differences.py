@@ -162,4 +162,4 @@ def test_slopes_of_all_losses_on_a_mesh_with_hard_inter_reflection(samples_stay,
     model, batch = torus_model(light), pixels()
     traced = keep_first(monkeypatch, scene_module, "scene_light")
     assert_slopes_of_stage(model, batch, stage)
-    assert 0.02 < (traced[0].radiance > 0).any(-1).double().mean() < 0.95
+    assert 0.05 < (traced[0].radiance > 0).any(-1).double().mean() < 0.95

@@ -241,12 +241,12 @@ LONG = {
     "autocast to bfloat16": Case(PAINT, PAINT_BOUNDS, {"autocast": True}),
     "mesh": Case(
         PAINT,
-        {"base_color": 0.009, "roughness": 0.018, "metallic": 0.019, "image": 0.025, "radiance": 0.14},
+        {"base_color": 0.009, "roughness": 0.013, "metallic": 0.019, "image": 0.025, "radiance": 0.14},
         {"mesh": True},
     ),
     "mesh, LDR": Case(
         PAINT,
-        {"base_color": 0.011, "roughness": 0.021, "metallic": 0.028, "image": 0.033, "radiance": 0.14},
+        {"base_color": 0.011, "roughness": 0.014, "metallic": 0.028, "image": 0.033, "radiance": 0.14},
         {"mesh": True, "response": "srgb"},
     ),
     "light not known": Case(PAINT, {"scaled_base_color": 0.145, "image": 0.12}, {"known_light": False}),
