@@ -70,9 +70,9 @@ def radiance_times_cosine(luminance: Float[Tensor, "H W"], normal: Float[Tensor,
     """Sampling in proportion to an interpolated map times the cosine about a normal.
 
     Args:
-        luminance: luminance of each texel up to a common factor, positive. Between texels it is interpolated
-            linearly in the azimuth and in the cosine of the polar angle. `direction_map.interpolate` is linear
-            in the polar angle itself; the two differ by a factor of at most 2, at the poles.
+        luminance: luminance of each texel up to a common factor, positive. Between texels it is linear in the
+            azimuth and in the cosine of the polar angle. `direction_map.interpolate` is linear in the polar
+            angle itself; the two differ by a factor of at most 2, at the poles.
         normal: unit normals.
 
     Returns:
