@@ -265,8 +265,8 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "rays towards the light count twice in light fits",
         "lighting/map_transport.py",
-        "density = density + sum(count * technique.pdf(wi) for technique, count in techniques)",
-        "density = density + 0 * sum(count * technique.pdf(wi) for technique, count in techniques)",
+        "sum((count * technique.pdf(wi) for technique, count in techniques)",
+        "sum((0 * technique.pdf(wi) for technique, count in techniques)",
         "lighting/test_fit.py",
     ),
     Mutant(

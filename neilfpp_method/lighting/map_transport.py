@@ -17,7 +17,7 @@ from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.sampling import Technique, specular_lobe
 from neilfpp_method.structures import Observed, SceneLight, SceneTracer
 
-__all__ = ["TexelRays", "from_texels", "trace_texels"]
+__all__ = ["LIGHT_RAYS", "TexelRays", "from_texels", "trace_texels"]
 
 LIGHT_RAYS = 64
 """Rays per point in directions that are drawn from the map itself. With one ray in each texel alone, what a
@@ -74,7 +74,7 @@ class TexelRays:
     Attributes:
         wi: their directions.
         texel: index of the texel that contains each direction.
-        density: expected number of rays per steradian at each direction.
+        density: expected number of rays per steradian at each direction (`_density`).
         size: rows and columns of the map.
         scene_light: the light that the rays meet in the scene, and which rays meet it; None without a scene.
     """
@@ -100,10 +100,24 @@ class TexelRays:
         scene_light = None if self.scene_light is None else self.scene_light[points]
         return TexelRays(self.wi[points], self.texel[points], self.density[points], self.size, scene_light)
 
-    def redrawn(self, environment: EnvironmentLight, position: Float[Tensor, "N 3"]) -> TexelRays:
-        """The rays with other directions in the same texels, and the same hits."""
+    def redrawn(
+        self,
+        environment: EnvironmentLight,
+        position: Float[Tensor, "N 3"],
+        techniques: Sequence[tuple[Technique, int]] = (),
+    ) -> TexelRays:
+        """The rays with other directions in the same texels, and the same hits.
+
+        Args:
+            environment: the map.
+            position: the points.
+            techniques: those that drew the last rays of each point, which keep their directions.
+        """
         drawn = environment.texel_directions(position)
-        return replace(self, wi=drawn.wi.gather(1, self.texel[..., None].expand(-1, -1, 3)))
+        count = self.texel.shape[1] - sum(count for _, count in techniques)
+        wi = drawn.wi.gather(1, self.texel[:, :count, None].expand(-1, -1, 3))
+        wi = torch.cat((wi, self.wi[:, count:]), 1)
+        return replace(self, wi=wi, density=_density(self.texel, wi, self.size, techniques))
 
     def with_techniques(
         self,
@@ -121,18 +135,16 @@ class TexelRays:
         if not techniques:
             return self
         drawn = torch.cat([technique.draw(count, True) for technique, count in techniques], 1)
-        texel = texels_of(drawn, *self.size)
-        solid_angle = texel_solid_angles(*self.size, drawn.device).to(drawn.dtype)[texel]
+        texel = torch.cat((self.texel, texels_of(drawn, *self.size)), 1)
         wi = torch.cat((self.wi, drawn), 1)
-        density = torch.cat((self.density, 1.0 / solid_angle), 1)
-        density = density + sum(count * technique.pdf(wi) for technique, count in techniques)
+        density = _density(texel, wi, self.size, techniques)
         scene_light = None
         if scene is not None:
             further = scene(position, drawn)
             scene_light = self.scene_light.map_named(
                 lambda name, rays: torch.cat((rays, getattr(further, name)), 1)
             )
-        return TexelRays(wi, torch.cat((self.texel, texel), 1), density, self.size, scene_light)
+        return TexelRays(wi, texel, density, self.size, scene_light)
 
     def weight(self, normal: Float[Tensor, "N 3"]) -> Float[Tensor, "N S"]:
         """Cosine about the normals of the points, divided by the density."""
@@ -188,4 +200,15 @@ def trace_texels(
     texel = weight.topk(height * width // 2, dim=1).indices
     wi = drawn.wi.gather(1, texel[..., None].expand(-1, -1, 3))
     scene_light = None if scene is None else scene(position, wi)
-    return TexelRays(wi, texel, 1.0 / drawn.solid_angle[texel], (height, width), scene_light)
+    return TexelRays(wi, texel, _density(texel, wi, (height, width)), (height, width), scene_light)
+
+
+def _density(
+    texel: Int[Tensor, "N S"],
+    wi: Float[Tensor, "N S 3"],
+    size: tuple[int, int],
+    techniques: Sequence[tuple[Technique, int]] = (),
+) -> Float[Tensor, "N S"]:
+    """Expected number of rays per steradian: one in each texel, and those that techniques draw."""
+    solid_angle = texel_solid_angles(*size, wi.device).to(wi.dtype)
+    return sum((count * technique.pdf(wi) for technique, count in techniques), 1.0 / solid_angle[texel])
