@@ -12,15 +12,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.measurement import Measurement, mean_reduction
-from neilfpp_method.effects.places.grid import METALLICS
-from neilfpp_method.effects.places.lit import PAINT, LitPlaces, with_lobe
+from neilfpp_method.effects.places.lit import PAINT, PAINT_OR_METAL, LitPlaces, with_lobe
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import GGX_BURLEY
 
 __all__ = ["diffuse_evidence"]
 
-PAINT_AND_METAL = range(0, len(METALLICS), len(METALLICS) - 1)
-"""Indices in `METALLICS` of 0 and 1: what lies between differs little in a comparison of diffuse lobes."""
 FOLDS = 3
 """Number of folds of the views; every fold is held back in turn."""
 THRESHOLD = 0.0005
@@ -46,5 +43,5 @@ def diffuse_evidence(model: NeilfModel, lit: LitPlaces) -> Measurement:
 def _errors(lit: LitPlaces, fold: int, metals: bool) -> Float[Tensor, " P"]:
     """The error of each place in a fold of the views, with the best material for the other views."""
     split = lit.hold_back(fold, FOLDS)
-    best = split.known.best(PAINT_AND_METAL if metals else PAINT)
+    best = split.known.best(PAINT_OR_METAL if metals else PAINT)
     return split.held_back.mean_errors(best.material)

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import torch
 
 from neilfpp_method.effects.light_scale import MIN_METAL_SHARE, lowest_scale, with_prior
-from neilfpp_method.effects.places.grid import METALLICS
-from neilfpp_method.effects.places.lit import PAINT, LitPlaces
+from neilfpp_method.effects.places.lit import PAINT, PAINT_OR_METAL, LitPlaces
 from neilfpp_method.lighting.objective import DARK_FLOOR
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
@@ -65,7 +64,7 @@ def correct_scale(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> Res
     if not solver.scale_is_free or (current.metallic > 0.5).float().mean() >= MIN_METAL_SHARE:
         return None
     mean = current.base_color.clamp_min(DARK_FLOOR).log().mean().exp().item()
-    permitted = range(len(METALLICS)) if model.brdf.metals else PAINT
+    permitted = PAINT_OR_METAL if model.brdf.metals else PAINT
     errors = dict.fromkeys((mean * factor for factor in FACTORS), 0.0)
     for number in range(FOLDS):
         split = lit.hold_back(number, FOLDS)
