@@ -137,7 +137,7 @@ class SurfaceHits(Indexable):
 
     Attributes:
         color: linear radiance of the whole ray, background included.
-        position: hit position, blended along the ray with the rendering weights.
+        position: hit position, blended from samples of the ray with their rendering weights.
         normal: outward unit normal, blended in the same way; zero for a miss.
         opacity: sum of the rendering weights, in [0, 1].
         concentration: share of the rendering weight that lies close to `position`; 1 for a hit of a sharp

@@ -29,6 +29,7 @@ from neilfpp_method.volume.compositing import (
     composite,
     depth_weights,
     mean_depth,
+    near_median,
     sample_weights,
     share_near,
     surface_depth,
@@ -104,8 +105,7 @@ class VolSdfHost(nn.Module):
         self.free_space = None if balls is None else FreeSpace(balls, radius)
         self.empty_space = EmptySpace(radius) if volume.skip_empty else None
         self.sample_counts = sample_counts(volume)
-        hard = config.light.inter_reflection == "hard"
-        resolution = GRID_RESOLUTION if hard else 0
+        resolution = GRID_RESOLUTION if config.light.inter_reflection == "hard" else 0
         # The grid and its age are in checkpoints, so that a resumed run traces the same grid.
         self.register_buffer("distance_grid", torch.zeros(resolution, resolution, resolution))
         self.grid_age: int | None = None
@@ -323,15 +323,17 @@ class VolSdfHost(nn.Module):
         radiance: Float[Tensor, "N M 3"] | None,
     ) -> SurfaceHits:
         weights = sample_weights(intervals.weights)
-        depth = self._depth(rays, distances, weights, surface)
+        # A ray that passes an edge meets two surfaces: its hit lies on one of them, and has its normal.
+        of_hit = weights * near_median(distances, intervals.weights, HIT_RADIUS)
+        depth = self._depth(rays, distances, of_hit, surface)
         color = torch.zeros_like(rays.origins)
         if radiance is not None:
-            color = composite(weights, radiance)
-            color = color + self._background(rays, intervals.transmittance, radiance[:, -1])
+            behind = self._background(rays, intervals.transmittance, radiance[:, -1])
+            color = composite(weights, radiance) + behind
         return SurfaceHits(
             color=color,
             position=rays.origins + depth[:, None] * rays.directions,
-            normal=safe_normalize(composite(weights, normals)),
+            normal=safe_normalize(composite(of_hit, normals)),
             opacity=intervals.opacity,
             concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
         )
@@ -343,10 +345,8 @@ class VolSdfHost(nn.Module):
         weights: Float[Tensor, "N M"],
         surface: SdfSample,
     ) -> Float[Tensor, " N"]:
-        """Depth of the hits: of the zero set with the entering density, else the mean of the samples.
-
-        On shapes that are learned from a ball, hits at the zero set of the isotropic density were up to twice
-        as far from the true surface as the mean.
+        """Depth of the hits: of the zero set with the entering density, else the mean of the samples. On
+        shapes that are learned from a ball, the zero set was up to twice as far from the true surface.
         """
         if self.density_kind == "isotropic":
             return mean_depth(weights, distances)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "composite",
     "depth_weights",
     "mean_depth",
+    "near_median",
     "render_weights",
     "sample_weights",
     "share_near",
@@ -78,6 +79,32 @@ def mean_depth(weights: Float[Tensor, "N M"], distances: Float[Tensor, "N M"]) -
     """
     weighted = (weights * distances).sum(-1) + SPARE_WEIGHT * distances[:, -1]
     return weighted / (weights.sum(-1) + SPARE_WEIGHT)
+
+
+def near_median(
+    distances: Float[Tensor, "N M"], weights: Float[Tensor, "N M-1"], radius: float
+) -> Bool[Tensor, "N M"]:
+    """Samples around the median depth of each ray, at which half of its weight is reached.
+
+    A ray that passes an edge meets two surfaces. The mean depth lies in the empty space between them, the
+    median on the surface with the larger weight.
+
+    Args:
+        distances: ends of the intervals, ascending, scene units.
+        weights: weights of the intervals.
+        radius: largest distance from the interval of the median that counts as near, scene units.
+
+    Returns:
+        Which ends of the intervals are near; both ends of the interval of the median always are.
+
+    Example:
+        >>> near_median(torch.tensor([[1.0, 1.1, 3.0, 3.1]]), torch.tensor([[0.6, 0.0, 0.4]]), 0.05)
+        tensor([[ True,  True, False, False]])
+    """
+    reached = weights.cumsum(-1)
+    median = (reached < 0.5 * reached[:, -1:]).sum(-1, keepdim=True)
+    start, end = distances.gather(1, median), distances.gather(1, median + 1)
+    return (distances >= start.clamp_max(end - radius)) & (distances <= end.clamp_min(start + radius))
 
 
 def surface_depth(

@@ -74,6 +74,42 @@ def test_hits_of_the_isotropic_density_are_the_mean_of_the_samples():
     assert host.sdf(hits.position).median().item() == pytest.approx(-0.34 * beta, abs=0.05 * beta)
 
 
+class BallBeforeWall(torch.nn.Module):
+    """A ball around the origin, half a unit in front of the wall z = 1.1."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.minimum(x.norm(dim=-1) - RADIUS, 1.1 - x[:, 2])
+
+    def with_gradient(self, x: Tensor) -> SdfSample:
+        is_ball = x.norm(dim=-1) - RADIUS < 1.1 - x[:, 2]
+        gradient = torch.where(is_ball[:, None], normalize(x, dim=-1), torch.tensor([0.0, 0.0, -1.0]))
+        return SdfSample(self(x), gradient, torch.zeros(len(x), 15))
+
+
+def rays_past_the_ball(count: int = 400) -> RayBatch:
+    """Parallel rays within 0.05 of the silhouette of the ball."""
+    height = torch.linspace(RADIUS - 0.05, RADIUS + 0.05, count)
+    origins = torch.stack((torch.zeros(count), height, torch.full((count,), -2.0)), -1)
+    return RayBatch(origins, torch.tensor([[0.0, 0.0, 1.0]]).expand(count, 3))
+
+
+@pytest.mark.parametrize("density", ["isotropic", "entering"])
+def test_a_ray_past_an_edge_hits_one_of_its_two_surfaces(density):
+    config = changed(tiny_config(), {"host.volume": {"beta_init": 0.003, "samples": 64, "density": density}})
+    host = sphere_model(config).eval().host
+    host.sdf_field = BallBeforeWall()
+    with torch.no_grad():
+        march = host._march(rays_past_the_ball(), colored=False)
+    hits, depth = march.hits, march.hits.position[:, 2]
+    on_ball, on_wall = depth < 0.1, (depth - 1.1).abs() < 0.03
+    assert (on_ball | on_wall).float().mean() > 0.97
+    assert on_ball.sum() > 100
+    assert on_wall.sum() > 100
+    assert (hits.normal[on_wall, 2] < -0.98).float().mean() > 0.97
+    # Many of these rays meet both: their mean depth would lie between the two.
+    assert ((hits.concentration > 0.1) & (hits.concentration < 0.9)).sum() > 20
+
+
 def test_a_miss_has_the_background_color(sharp):
     sharp.background_color.fill_(0.25)
     misses = RayBatch(torch.tensor([[0.0, 0.0, -3.0], [0.0, 9.0, -3.0]]), torch.tensor([[0.0, 1.0, 0.0]] * 2))

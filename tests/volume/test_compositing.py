@@ -11,6 +11,7 @@ import torch
 from neilfpp_method.volume.compositing import (
     composite,
     depth_weights,
+    near_median,
     render_weights,
     sample_weights,
     share_near,
@@ -75,6 +76,23 @@ def test_the_share_near_a_depth_takes_parts_of_intervals():
     near = share_near(distances, weights, torch.tensor([2.0]), 1.5)  # from 0.5 to 3.5
     assert near.item() == pytest.approx(0.5 * 0.1 + 0.4 + 0.5 * 0.3)
     assert share_near(distances, weights, torch.tensor([9.0]), 1.5).item() == 0.0
+
+
+@pytest.mark.parametrize(("front", "near"), [(0.6, [1, 1, 0, 0]), (0.4, [0, 0, 1, 1])])
+def test_the_samples_near_the_median_are_those_of_the_surface_with_the_larger_weight(front, near):
+    distances = torch.tensor([[1.0, 1.02, 3.0, 3.02]])
+    weights = torch.tensor([[front, 0.0, 1.0 - front]])
+    # The opacity of a ray does not matter.
+    for opacity in (1.0, 0.3):
+        assert near_median(distances, opacity * weights, 0.05).tolist() == [near]
+
+
+def test_the_ends_of_the_interval_of_the_median_are_near_however_wide_it_is():
+    distances = torch.tensor([[1.0, 2.0, 2.04, 2.1, 4.0]])
+    assert near_median(distances, torch.tensor([[1.0, 0, 0, 0]]), 0.05).tolist() == [[1, 1, 0, 0, 0]]
+    assert near_median(distances, torch.tensor([[0, 1.0, 0, 0]]), 0.05).tolist() == [[0, 1, 1, 0, 0]]
+    assert near_median(distances, torch.tensor([[0, 1.0, 0, 0]]), 0.2).tolist() == [[0, 1, 1, 1, 0]]
+    assert near_median(distances, torch.zeros(1, 4), 0.05).tolist() == [[1, 1, 0, 0, 0]]  # an empty ray
 
 
 def depth_of_plane(plane, cosine, beta=0.02):
