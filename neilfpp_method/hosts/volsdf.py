@@ -323,8 +323,10 @@ class VolSdfHost(nn.Module):
         radiance: Float[Tensor, "N M 3"] | None,
     ) -> SurfaceHits:
         weights = sample_weights(intervals.weights)
-        # A ray that passes an edge meets two surfaces: its hit lies on one of them, and has its normal.
-        of_hit = weights * near_median(distances, intervals.weights, HIT_RADIUS)
+        of_hit = weights
+        if self.density_kind == "entering":
+            # A ray past an edge meets two surfaces: its hit lies on one of them, and has its normal.
+            of_hit = weights * near_median(distances, intervals.weights, HIT_RADIUS)
         depth = self._depth(rays, distances, of_hit, surface)
         color = torch.zeros_like(rays.origins)
         if radiance is not None:
@@ -345,9 +347,7 @@ class VolSdfHost(nn.Module):
         weights: Float[Tensor, "N M"],
         surface: SdfSample,
     ) -> Float[Tensor, " N"]:
-        """Depth of the hits: of the zero set with the entering density, else the mean of the samples. On
-        shapes that are learned from a ball, the zero set was up to twice as far from the true surface.
-        """
+        """Depth of the hits: of the zero set with the entering density, else the mean of the samples."""
         if self.density_kind == "isotropic":
             return mean_depth(weights, distances)
         slope = (surface.gradient.view(*weights.shape, 3) * rays.directions[:, None]).sum(-1)
