@@ -92,10 +92,10 @@ def near_median(
     Args:
         distances: ends of the intervals, ascending, scene units.
         weights: weights of the intervals.
-        radius: largest distance from the interval of the median that counts as near, scene units.
+        radius: largest distance from the farther end of the interval of the median, scene units.
 
     Returns:
-        Which ends of the intervals are near; both ends of the interval of the median always are.
+        Which samples are near; both ends of the interval of the median always are.
 
     Example:
         >>> near_median(torch.tensor([[1.0, 1.1, 3.0, 3.1]]), torch.tensor([[0.6, 0.0, 0.4]]), 0.05)
