@@ -174,16 +174,16 @@ LATER_FAULTS: Sequence[Mutant] = (
     ),
     Mutant(
         "hits are the mean of the samples, inside the surface",
-        "volume/compositing.py",
+        "volume/hits.py",
         "depth = mean + inside",
         "depth = mean + 0.0 * inside",
-        "volume/test_compositing.py",
+        "volume/test_hits.py",
     ),
     Mutant(
         "hits of rays past an edge lie between the two surfaces",
-        "hosts/volsdf.py",
-        "of_hit = weights * near_median(distances, intervals.weights, HIT_RADIUS)",
-        "of_hit = weights * near_median(distances, intervals.weights, 9.0)",
+        "volume/hits.py",
+        "weights = weights * near_median(distances, intervals.weights, HIT_RADIUS)",
+        "weights = weights * near_median(distances, intervals.weights, 9.0)",
         "hosts/test_volsdf.py",
     ),
     Mutant(
@@ -195,9 +195,9 @@ LATER_FAULTS: Sequence[Mutant] = (
     ),
     Mutant(
         "hits of the isotropic density lie at its zero set",
-        "hosts/volsdf.py",
-        'if self.density_kind == "isotropic":\n            return mean_depth',
-        "if False:\n            return mean_depth",
+        "volume/hits.py",
+        'if kind == "isotropic":',
+        "if False:",
         "hosts/test_volsdf.py",
     ),
     # L_phys from two estimates.

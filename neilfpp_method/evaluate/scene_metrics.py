@@ -13,7 +13,7 @@ from neilfpp_method.evaluate import metrics
 from neilfpp_method.export.extract import extract_mesh
 from neilfpp_method.model import EVAL_RAYS
 from neilfpp_method.train.run import Run
-from neilfpp_method.volume.compositing import HIT_RADIUS
+from neilfpp_method.volume.hits import HIT_RADIUS
 
 __all__ = ["chamfer_metrics", "light_metrics"]
 

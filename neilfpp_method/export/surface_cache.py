@@ -27,7 +27,7 @@ from neilfpp_method.hosts.base import HasSdf
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.train.run import Run
-from neilfpp_method.volume.compositing import HIT_RADIUS
+from neilfpp_method.volume.hits import HIT_RADIUS
 
 __all__ = [
     "ExtractedSurface",

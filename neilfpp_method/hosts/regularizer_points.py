@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.fields.sdf import SdfSample
-from neilfpp_method.volume.compositing import HIT_RADIUS
+from neilfpp_method.volume.hits import HIT_RADIUS
 
 __all__ = ["SURFACE_WIDTH", "RegularizerInputs", "regularizer_inputs"]
 

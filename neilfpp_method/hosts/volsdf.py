@@ -23,22 +23,13 @@ from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import LossTerm, OrientedPoints, PixelBatch, RayBatch, SceneLight, SurfaceHits
 from neilfpp_method.timing.ledger import timed
-from neilfpp_method.volume.compositing import (
-    HIT_RADIUS,
-    Weights,
-    composite,
-    depth_weights,
-    mean_depth,
-    near_median,
-    sample_weights,
-    share_near,
-    surface_depth,
-)
+from neilfpp_method.volume.compositing import Weights, composite, depth_weights, sample_weights
 from neilfpp_method.volume.density import DensityKind, LaplaceDensity, optical_depth
 from neilfpp_method.volume.distance_grid import GRID_RESOLUTION, sample_grid, trace_grid
 from neilfpp_method.volume.empty_space import EmptySpace, EvaluationSpace, evaluation_space
 from neilfpp_method.volume.entering_samples import entering_samples
 from neilfpp_method.volume.free_space import FreeSpace, free_balls
+from neilfpp_method.volume.hits import blend_hits
 from neilfpp_method.volume.intersect import Interval, sphere_interval
 from neilfpp_method.volume.partition import SampleCounts, sample_counts
 from neilfpp_method.volume.samplers import error_bounded_samples
@@ -322,36 +313,19 @@ class VolSdfHost(nn.Module):
         normals: Float[Tensor, "N M 3"],
         radiance: Float[Tensor, "N M 3"] | None,
     ) -> SurfaceHits:
-        weights = sample_weights(intervals.weights)
-        of_hit = weights
-        if self.density_kind == "entering":
-            # A ray past an edge meets two surfaces: its hit lies on one of them, and has its normal.
-            of_hit = weights * near_median(distances, intervals.weights, HIT_RADIUS)
-        depth = self._depth(rays, distances, of_hit, surface)
+        sdf, gradient = surface.distance.view_as(distances), surface.gradient.view_as(normals)
+        hit = blend_hits(self.density_kind, rays.directions, distances, intervals, sdf, gradient)
         color = torch.zeros_like(rays.origins)
         if radiance is not None:
             behind = self._background(rays, intervals.transmittance, radiance[:, -1])
-            color = composite(weights, radiance) + behind
+            color = composite(sample_weights(intervals.weights), radiance) + behind
         return SurfaceHits(
             color=color,
-            position=rays.origins + depth[:, None] * rays.directions,
-            normal=safe_normalize(composite(of_hit, normals)),
+            position=rays.origins + hit.depth[:, None] * rays.directions,
+            normal=safe_normalize(composite(hit.weights, normals)),
             opacity=intervals.opacity,
-            concentration=share_near(distances, intervals.weights.detach(), depth.detach(), HIT_RADIUS),
+            concentration=hit.concentration,
         )
-
-    def _depth(
-        self,
-        rays: RayBatch,
-        distances: Float[Tensor, "N M"],
-        weights: Float[Tensor, "N M"],
-        surface: SdfSample,
-    ) -> Float[Tensor, " N"]:
-        """Depth of the hits: of the zero set with the entering density, else the mean of the samples."""
-        if self.density_kind == "isotropic":
-            return mean_depth(weights, distances)
-        slope = (surface.gradient.view(*weights.shape, 3) * rays.directions[:, None]).sum(-1)
-        return surface_depth(weights, distances, surface.distance.view_as(weights), slope)
 
     def _background(
         self, rays: RayBatch, transmittance: Float[Tensor, " N"], at_far: Float[Tensor, "N 3"]
