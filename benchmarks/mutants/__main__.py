@@ -3,6 +3,7 @@
     python -m benchmarks.mutants            plant all of them, and print the table
     python -m benchmarks.mutants --write    also write it into docs/stability.md
     python -m benchmarks.mutants --only V   plant those whose module or description contains this word
+    python -m benchmarks.mutants --part 1 2 plant every second one, so that two processes can share them
 
 The exit status is 1 if a fault is not noticed, or if a test fails without one.
 """
@@ -18,14 +19,18 @@ from benchmarks.mutants.planting import try_all
 from benchmarks.mutants.table import table, write_table
 
 
-def main(write: bool = False, only: str = "") -> int:
+def main(write: bool = False, only: str = "", part: tuple[int, int] = (1, 1)) -> int:
     """Plant faults one at a time, and print which quick test notices each.
 
     Args:
         write: put the table into docs/stability.md; rows of faults that were not planted are left unchanged.
         only: plant only faults whose module or description contains this text.
+        part: number of a part, from 1, and the number of parts to which these faults are dealt out.
     """
-    chosen = [mutant for mutant in MUTANTS if only in mutant.module or only in mutant.what]
+    number, parts = part
+    chosen = [mutant for mutant in MUTANTS if only in mutant.module or only in mutant.what][
+        number - 1 :: parts
+    ]
     outcomes = try_all(
         chosen, lambda v: print(f"{v.mutant.what}: {v.noticed_by or 'NOT NOTICED'}", flush=True)
     )
