@@ -51,17 +51,22 @@ class Report:
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a command: its exit status (negative: the signal), its standard error, and its seconds."""
+    """The end of a command: its exit status (negative: the signal), its standard error, its seconds, and
+    whether it was still running when it was to be killed.
+    """
 
     status: int
     said: str
     seconds: float
+    was_killed: bool
 
 
 def run(
     folder: Path, *words: str, kill: signal.Signals | None = None, after: float = 0.0, twice: bool = False
 ) -> Ended:
-    """Run a command in a copy of this process; `kill` it after so many seconds, `twice` in a row."""
+    """Run a command in a copy of this process; `kill` it after so many seconds, `twice` in a row, unless it
+    has ended before.
+    """
     said, began = folder / "said", time.monotonic()
     said.write_text("")
     asking = {signal.SIGINT, signal.SIGTERM}
@@ -70,12 +75,23 @@ def run(
     if not child:
         _become_command(said, words, asking)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, asking)
-    if kill is not None:
-        time.sleep(after)
+    was_killed = kill is not None and _is_running_after(child, after)
+    if was_killed:
         for _ in range(1 + twice):
             os.kill(child, kill)  # it was not waited for, so its process id is still valid
     _, status = os.waitpid(child, 0)
-    return Ended(os.waitstatus_to_exitcode(status), said.read_text(), time.monotonic() - began)
+    seconds = time.monotonic() - began
+    return Ended(os.waitstatus_to_exitcode(status), said.read_text(), seconds, was_killed)
+
+
+def _is_running_after(child: int, seconds: float) -> bool:
+    """Wait for so many seconds, or until a process ends, and return whether it is still running."""
+    end = time.monotonic() + seconds
+    while os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None:
+        if time.monotonic() >= end:
+            return True
+        time.sleep(0.005)
+    return False
 
 
 def _become_command(said: Path, words: tuple[str, ...], asking: set[signal.Signals]) -> None:
@@ -119,6 +135,8 @@ def train_words(folder: Path, out: Path, resume: bool) -> list[str]:
 def attack_training(report: Report, folder: Path, draw: random.Random, kills: int) -> Path:
     """Kill trainings, up to four times each, and let each finish; returns one that was not interrupted."""
     whole = folder / "whole"
+    # The first training may have to compile loops, which would make the range of random moments too long.
+    run(folder, *train_words(folder, folder / "first", resume=False))
     took = run(folder, *train_words(folder, whole, resume=False))
     if took.status:
         raise RuntimeError(took.said)
@@ -131,7 +149,7 @@ def attack_training(report: Report, folder: Path, draw: random.Random, kills: in
             what = f"train, {kill.name}{' twice' if twice else ''}"
             words = train_words(folder, out, resume=(out / "config.json").exists())
             ended = run(folder, *words, kill=kill, after=draw.uniform(0.0, 1.1 * took.seconds), twice=twice)
-            report.kills[what] += 1
+            report.kills[what] += ended.was_killed
             check_end(report, what, ended)
             check_files(report, what, out)
         ended = run(folder, *train_words(folder, out, resume=(out / "config.json").exists()))
@@ -186,9 +204,10 @@ def attack_command(
             shutil.copytree(original, run_folder)
         for _ in range(min(draw.randint(1, 3), kills - done)):
             kill = draw.choice(SIGNALS)
-            what, done = f"{words[0]}, {kill.name}", done + 1
+            what = f"{words[0]}, {kill.name}"
             ended = run(folder, *words, kill=kill, after=draw.uniform(0.0, whole.seconds))
-            report.kills[what] += 1
+            report.kills[what] += ended.was_killed
+            done += ended.was_killed
             check_end(report, what, ended)
             check_files(report, what, run_folder)
             report.faults += [
@@ -232,9 +251,10 @@ def attack_prepare(report: Report, folder: Path, draw: random.Random, kills: int
         out, number = folder / f"prepared-{number}", number + 1
         for _ in range(draw.randint(1, 3)):
             kill = draw.choice(SIGNALS)
-            what, done = f"prepare, {kill.name}", done + 1
+            what = f"prepare, {kill.name}"
             ended = run(folder, *words(out), kill=kill, after=draw.uniform(0.0, took.seconds))
-            report.kills[what] += 1
+            report.kills[what] += ended.was_killed
+            done += ended.was_killed
             check_end(report, what, ended)
             check_files(report, what, out)
         ended = run(folder, *words(out))
