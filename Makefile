@@ -33,7 +33,7 @@ test-slow: $(VENV)/.installed-dev
 
 # Thousands of damaged files, killed commands and planted faults (docs/stability.md); prints their counts.
 test-hard: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(RUN)/python -m pytest tests/hard_cases -m hard -n 2 --dist load
+	OMP_NUM_THREADS=1 $(RUN)/python -m pytest tests/hard_cases -m hard -n 2 --dist worksteal
 
 # Nerfstudio pins a different OpenCV package, so its tests have a separate environment. The .pth file lets the
 # ns-* commands start in it by hand (tests_nerfstudio/cpu_torchvision.py).

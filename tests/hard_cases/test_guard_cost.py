@@ -7,7 +7,7 @@ import pytest
 from benchmarks.guard_cost import LARGEST_SHARE, guard_costs
 
 MEASUREMENTS = 3
-"""The least of them counts, because other work on the machine only makes the checks slower."""
+"""The smallest of them counts, because other work on the machine only makes the checks slower."""
 
 
 @pytest.mark.hard

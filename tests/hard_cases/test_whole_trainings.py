@@ -216,23 +216,22 @@ CASES = {
         },
         {"config": changed(small_paper_ngp(), PAPER), "hdr": False, "cloud": CLOUD},
     ),
-    # It is found as a mirror (`NOT_RECOVERED`); otherwise it is right.
     "polished metal, mesh": Case(
         POLISHED,
         {
             **ON_MESH,
             "scaled_base_color": 0.05,
-            "roughness": 0.19,
-            "metallic": 0.15,
+            "roughness": 0.1,
+            "metallic": 0.05,
             "image": 0.1,
             "radiance": 0.55,
         },
         {"config": small_mesh(small_fast()), "changes": {"train.material_steps": 1000}, "mesh": BALL},
     ),
-    # It is found as a mirror (`NOT_RECOVERED`).
+    # Two of three seeds find a mirror (docs/stability.md), so the roughness has no bound.
     "polished metal, mesh, known map": Case(
         POLISHED,
-        ON_MESH,
+        {**ON_MESH, "scaled_base_color": 0.06, "metallic": 0.11, "image": 0.14},
         {"config": small_mesh(small_fast()), "mesh": BALL, "known_map": POLISHED.environment},
     ),
     "mirror": Case(
@@ -242,7 +241,7 @@ CASES = {
             "normal": 12.0,
             "position": 0.035,
             "scaled_base_color": 0.08,
-            "roughness": 0.11,
+            "roughness": 0.23,
             "metallic": 0.27,
             "image": 0.38,
             "radiance": 0.45,
@@ -253,8 +252,7 @@ NOT_RECOVERED = [
     ("paint, exposures of ± ½ EV", "scaled_base_color", 0.12),
     ("paint, exposures of ± ½ EV", "roughness", 0.1),
     ("paint, LDR", "roughness", 0.1),
-    ("polished metal, mesh", "roughness", 0.1),
-    ("polished metal, mesh, known map", "roughness", 0.1),
+    ("mirror", "roughness", 0.1),
     ("mirror", "image", 0.1),
 ]
 """Bounds that are exceeded, each as large as would be useful."""
@@ -275,7 +273,8 @@ class WithoutOutline:
 
 
 THIN = {
-    "thin plate": SurfaceErrors(0.056, 16.0, 0.03, 0.0075, missed=0.17, detail=0.015),
+    # The share of the edge that is missed depends on the seed: 0.22, 0.05, 0.09 and 0.10.
+    "thin plate": SurfaceErrors(0.056, 16.0, 0.03, 0.0075, missed=0.3, detail=0.015),
     "wire": SurfaceErrors(0.26, 21.5, 0.0135, 0.0033, missed=0.1, detail=0.013),
 }
 
@@ -308,9 +307,8 @@ def test_surface_material_and_light_are_recovered_together(name):
 @pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="an over-exposed highlight hides the roughness, few directions make polished metal a mirror, the "
-    "reflections of a recovered mirror are not sharp, and gains that are not measured at a cloud are hardly "
-    "learned (docs/stability.md)",
+    reason="an over-exposed highlight hides the roughness, the reflections of a recovered mirror are not "
+    "sharp, and gains that are not measured at a cloud are hardly learned (docs/stability.md)",
 )
 @pytest.mark.parametrize(("name", "measure", "bound"), NOT_RECOVERED)
 def test_values_that_are_not_recovered(name, measure, bound):
