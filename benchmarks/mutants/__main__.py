@@ -28,11 +28,10 @@ def main(write: bool = False, only: str = "", part: tuple[int, int] = (1, 1)) ->
         part: number of a part, from 1, and the number of parts to which these faults are dealt out.
     """
     number, parts = part
-    chosen = [mutant for mutant in MUTANTS if only in mutant.module or only in mutant.what][
-        number - 1 :: parts
-    ]
+    named = [mutant for mutant in MUTANTS if only in mutant.module or only in mutant.what]
     outcomes = try_all(
-        chosen, lambda v: print(f"{v.mutant.what}: {v.noticed_by or 'NOT NOTICED'}", flush=True)
+        named[number - 1 :: parts],
+        lambda v: print(f"{v.mutant.what}: {v.noticed_by or 'NOT NOTICED'}", flush=True),
     )
     caught = sum(outcome.noticed_by is not None for outcome in outcomes)
     print(f"\n{table(outcomes)}\n{caught} of {len(outcomes)} faults are noticed")
