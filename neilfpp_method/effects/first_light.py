@@ -55,10 +55,10 @@ quarters of them, each with half the usual number of rounds.
 """
 TIMED_PIXELS = 2000
 """Pixels of the products from which `seconds_of_pixel` is estimated."""
-OVERHEAD_SHARE = 3.0
+OVERHEAD_SHARE = 1.3
 """Share that tracing, the copies of the transport, and the search for materials add to the descents of the
-light, on one core of a server: with both kinds of evidence 3,000 pixels took 18 s, of which 4 s are descents
-by this count, and 15,000 pixels 85 and 18 s; without evidence 4 and 1.3 s, and 21 and 6 s.
+light, on one core of a busy server: with both kinds of evidence 5,000 pixels took 44 s, of which 19 s are
+descents by this count; without evidence 14 and 6 s.
 """
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import functional
 
 from neilfpp_method.lighting.decision import is_worthwhile
 from neilfpp_method.lighting.descent import Unknown, descend
@@ -147,10 +148,10 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
     root = (start.intensity * reach).clamp_min(first).sqrt().requires_grad_()
     # Sources that are visible from no point are left out of the sums: half of the texels for a table top.
     reaching_any = torch.nonzero(transport.sources.amax((0, 1)))[:, 0]
+    is_visible = _visible_share(transport.sources[0], start.log_radiance) > MIN_VISIBLE_SHARE
+    set_by_images = is_visible[reaching_any, None]
     transport = transport.select_sources(reaching_any)
     mean_transport = transport.sources[0].mean(0)
-    visible_share = (transport.sources[0] > 0).float().mean(0)
-    set_by_images = ((visible_share > MIN_VISIBLE_SHARE) | (reaching_any >= texels))[:, None]
 
     def light() -> MapAndLamps:
         colored = log_radiance.expand_as(start.log_radiance)
@@ -172,6 +173,28 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
     fitted = MapAndLamps(fitted.log_radiance.detach(), fitted.intensity.detach(), end.log_scale)
     finite = fitted.log_radiance.isfinite().all() and fitted.intensity.isfinite().all()
     return fitted if finite else start
+
+
+def _visible_share(
+    diffuse: Float[Tensor, "N T"], log_radiance: Float[Tensor, "3 H W"]
+) -> Float[Tensor, " T"]:
+    """Share of the points that see each source; 1 for lamps.
+
+    A point has fewer rays than there are texels, so a texel counts as visible if a ray reached it or one of
+    its neighbours.
+
+    Args:
+        diffuse: the diffuse part of the transport from the texels, row by row, followed by the lamps.
+        log_radiance: gives the size of the map.
+    """
+    _, height, width = log_radiance.shape
+    texels = height * width
+    share = diffuse.new_ones(diffuse.shape[1])
+    if texels:
+        reached = (diffuse[:, :texels] > 0).to(diffuse.dtype).view(-1, 1, height, width)
+        around = functional.pad(reached, (1, 1, 0, 0), mode="circular")
+        share[:texels] = functional.max_pool2d(around, 3, 1, (1, 0)).mean(0).flatten()
+    return share
 
 
 @dataclass(frozen=True)

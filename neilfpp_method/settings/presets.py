@@ -269,7 +269,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
 
     - Stages: R is trained first for a few steps, because light between surfaces influences the choice of the
       light; then R, B and L are trained together, in the steps of both other stages.
-    - R gets no feature of G, so it encodes positions itself; 8×128 is the paper's surface light field.
+    - R gets no feature of G, so it encodes positions itself, in a larger network.
     - The normals are given: they are not refined, and R need not support their recovery.
     - Rays through a mesh are cheap, so the light is solved for more often.
     """
@@ -277,7 +277,7 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     mesh = {
         "preset": f"{config.preset}-mesh",
         "host": {"kind": MeshConfig().kind},
-        "radiance": {"positions": "encoded", "layers": 8, "width": 128, "direction": "outgoing"},
+        "radiance": {"positions": "encoded", "layers": 4, "width": 128, "direction": "outgoing"},
         "shading.normals": "host",
         "loss.lambertian": 10.0 * config.loss.lambertian,
         "train.sdf_steps": train.sdf_steps // 20,
@@ -291,9 +291,11 @@ def fixed_geometry(config: NeilfConfig) -> NeilfConfig:
     return as_published_on_a_mesh(given) if config.preset.startswith("paper-") else given
 
 
-# Further differences of the paper's presets with a mesh: three stages with one learning rate, more rays.
+# Further differences of the paper's presets with a mesh: three stages with one learning rate, more rays, and
+# the surface light field of the paper as R.
 PAPER_MESH: Mapping[str, Any] = {
     "background.kind": "auto",
+    "radiance.layers": 8,
     "loss.smoothness": 5e-4,
     "loss.lambertian": 5e-3,
     "loss.position_gradient": 0.0,

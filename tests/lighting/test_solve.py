@@ -147,7 +147,7 @@ def test_lamps_are_found_under_a_known_map_which_is_unchanged():
     environment, lamps = EnvironmentLight(4, 1.0), Lamps(4, 0.06)
     environment.show(torch.full((3, 48, 70), 0.5))  # finer than the fit needs it
     before = environment.log_radiance.clone()
-    torch.manual_seed(0)
+    torch.manual_seed(2)
     for _ in range(3):
         evidence = solve(LightModel(environment, lamps), seen, of, known, first=False)
     assert torch.equal(environment.log_radiance, before)

@@ -35,17 +35,11 @@ PAINT_OR_METAL = range(0, len(METALLICS), len(METALLICS) - 1)
 light on brighter, slightly metallic surfaces explains the pixels nearly as well: under the true map of
 `tabletop_env`, held-back views preferred a mean base colour of 0.38 in place of 0.29, and without them 0.31.
 """
-DIRECTIONS = 2
-"""Random directions per texel and pixel."""
 NEIGHBORS_SHARE = 1 / 150
 """Share of the places whose errors are added when the material of a place is chosen."""
 COLOR_SCALE = 0.2
 """Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
 of the same look are often of one material.
-"""
-MAX_ROWS = 64
-"""Rows to which a finer map is reduced: a given map may have a million texels, and from every place a ray is
-traced towards each texel.
 """
 MIN_ROUGHNESS = 0.05
 """Roughnesses are raised to at least this value before they are rounded to the grid in log roughness."""
@@ -119,10 +113,10 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
             left out of the result.
     """
     places, seed = places.only_shown(), int(torch.randint(2**31, ()))
-    position = places.shared_points().position
+    position = places.position
     look = COLOR_SCALE * model.brdf(position).base_color.clamp_min(DARK_FLOOR).log()
     near = neighbors(torch.cat((position, look), -1), NEIGHBORS_SHARE)
-    layers = _mean_layers(model, places, model.lobe, seed)
+    layers = _layers(model, places, model.lobe, seed)
     return LitPlaces(places, layers, near, model.facts.median_radiance, seed)
 
 
@@ -132,16 +126,12 @@ def with_lobe(model: NeilfModel, lit: LitPlaces, lobe: Lobe) -> LitPlaces:
 
     The random directions are the same, so their noise cancels when two lobes are compared.
     """
-    return replace(lit, layers=_mean_layers(model, lit.places, lobe, lit.seed))
+    return replace(lit, layers=_layers(model, lit.places, lobe, lit.seed))
 
 
-def _mean_layers(model: NeilfModel, places: Places, lobe: Lobe, seed: int) -> LightLayers:
-    """Mean of the layers over `DIRECTIONS` draws of random directions."""
-    light, shared = LightModel(model.light.at_most(MAX_ROWS), model.lamps), places.shared_points()
+def _layers(model: NeilfModel, places: Places, lobe: Lobe, seed: int) -> LightLayers:
+    """The layers of the pixels under the light of a model, from random directions of this seed."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        draws = [light_layers(light, shared, ROUGHNESSES, lobe, model.scene) for _ in range(DIRECTIONS)]
-    return LightLayers(
-        torch.stack([drawn.light for drawn in draws]).mean(0),
-        torch.stack([drawn.scene for drawn in draws]).mean(0),
-    )
+        light = LightModel(model.light, model.lamps)
+        return light_layers(light, places.observed, ROUGHNESSES, lobe, model.scene)
