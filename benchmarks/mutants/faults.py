@@ -263,10 +263,10 @@ MUTANTS: Sequence[Mutant] = (
         "fields/test_map_sampling.py",
     ),
     Mutant(
-        "rays towards the light count twice in light fits",
-        "lighting/map_transport.py",
-        "sum((count * technique.pdf(wi) for technique, count in techniques)",
-        "sum((0 * technique.pdf(wi) for technique, count in techniques)",
+        "rays of light fits are weighted as if their density were uniform",
+        "lighting/rays.py",
+        "(drawn.wi.shape[1] * drawn.pdf)",
+        "(drawn.wi.shape[1] * drawn.pdf.mean())",
         "lighting/test_fit.py",
     ),
     Mutant(
