@@ -122,8 +122,9 @@ def radiance_times_cosine(luminance: Float[Tensor, "H W"], normal: Float[Tensor,
 def one_in_each_texel(height: int, width: int, normal: Float[Tensor, "N 3"]) -> Technique:
     """One random direction in each of the height × width / 2 texels of a map that are above the horizon.
 
-    That number of directions must be drawn. The texels are symmetric about the origin, so half of them lie
-    above any horizon, up to those that the horizon cuts.
+    That number of directions must be drawn. The texels are symmetric about the origin, so the centres of half
+    of them lie above any horizon. The other texels have a density too, although nothing is drawn in them:
+    other techniques would have large weights in their parts above the horizon.
 
     Args:
         height, width: size of the map.
