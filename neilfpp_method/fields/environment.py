@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from neilfpp_method.fields.direction_map import (
+    directions_within,
     interpolate,
     map_directions,
     texel_solid_angles,
@@ -22,7 +24,7 @@ from neilfpp_method.fields.map_sampling import radiance_times_cosine
 from neilfpp_method.shading.color import luminance
 from neilfpp_method.shading.sampling import Technique
 
-__all__ = ["EVEN_ROWS", "EnvironmentLight"]
+__all__ = ["EVEN_ROWS", "EnvironmentLight", "TexelDirections"]
 
 UNIFORM_SHARE = 0.1
 """Share of the samples that ignore the radiance, so that the density is positive above every horizon."""
@@ -30,6 +32,14 @@ EVEN_ROWS = 16
 """Rows of the map of an even light, whose texels are all equal."""
 MIN_RADIANCE = 1e-6
 """Lower bound on the radiance of a given map, relative to its mean, because logarithms are stored."""
+
+
+@dataclass(frozen=True)
+class TexelDirections:
+    """One direction in each of T texels, for each of N points, and the solid angles of the texels (sr)."""
+
+    wi: Float[Tensor, "N T 3"]
+    solid_angle: Float[Tensor, " T"]
 
 
 class EnvironmentLight(nn.Module):
@@ -114,6 +124,15 @@ class EnvironmentLight(nn.Module):
         None for an even light.
         """
         return None if self.even else radiance_times_cosine(self._sampled_luminance(), normal)
+
+    @torch.no_grad()
+    def texel_directions(self, like: Float[Tensor, "N 3"]) -> TexelDirections:
+        """Sample a random direction in every texel, for each row of `like`: T strata of the sphere."""
+        _, height, width = self.log_radiance.shape
+        texel = torch.arange(height * width, device=like.device).expand(len(like), -1)
+        within = torch.rand(2, *texel.shape, device=like.device, dtype=like.dtype)
+        wi = directions_within(texel, within[0], within[1], height, width)
+        return TexelDirections(wi, self._texel_solid_angles())
 
     def _resize(self, height: int, width: int) -> None:
         """Replace the map by one of this size, with undefined content."""

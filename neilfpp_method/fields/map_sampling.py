@@ -23,19 +23,15 @@ from torch import Tensor
 
 from neilfpp_method.fields.direction_map import (
     direction_at,
-    directions_within,
     interpolation_solid_angles,
     map_directions,
     polar_cosines,
-    texel_centers,
-    texel_solid_angles,
-    texels_of,
     weights_linear_in_cosine,
 )
 from neilfpp_method.shading.frame import at_least_float32
 from neilfpp_method.shading.sampling import Lattice, Technique
 
-__all__ = ["one_in_each_texel", "radiance_times_cosine"]
+__all__ = ["radiance_times_cosine"]
 
 CELL_ROWS = 24
 """Maximum number of rows of cells: 1152 cells, which are 8° high. The cosine changes little within a cell."""
@@ -115,31 +111,6 @@ def radiance_times_cosine(luminance: Float[Tensor, "H W"], normal: Float[Tensor,
         for texel, weight in zip(*weights_linear_in_cosine(wi, height, width), strict=True):
             total = total + weight * at_middle[texel] * probability.gather(1, cells.of_texel[texel])
         return total
-
-    return Technique(normal, place, pdf)
-
-
-def one_in_each_texel(height: int, width: int, normal: Float[Tensor, "N 3"]) -> Technique:
-    """One random direction in each of the height × width / 2 texels of a map that are above the horizon.
-
-    That number of directions must be drawn. The texels are symmetric about the origin, so the centres of half
-    of them lie above any horizon. The other texels have a density too, although nothing is drawn in them:
-    other techniques would have large weights in their parts above the horizon.
-
-    Args:
-        height, width: size of the map.
-        normal: unit normals.
-    """
-    normal = at_least_float32(normal)
-    solid_angle = texel_solid_angles(height, width, normal.device).to(normal)
-    cosine = normal @ texel_centers(height, width, normal.device).to(normal).t()
-
-    def place(at: Lattice) -> Float[Tensor, "N S 3"]:
-        above = cosine.topk(at.u.shape[1], dim=1).indices
-        return directions_within(above, at.w, at.v, height, width)
-
-    def pdf(wi: Float[Tensor, "N S 3"]) -> Float[Tensor, "N S"]:
-        return 2 / (height * width * solid_angle[texels_of(wi, height, width)])
 
     return Technique(normal, place, pdf)
 

@@ -1,8 +1,11 @@
 """Light transport at several roughnesses at once.
 
-All roughnesses share the rays of a pixel. The result has one layer for each part of the BRDF (see
-`transport`): first the diffuse part, one layer for each roughness if it depends on the roughness and else a
-single one, and then the facing and grazing parts at each roughness. `layers_of` has their indices.
+All roughnesses share the rays. Of an unknown light, rays are traced once per surface point, however many
+pixels show it (`texel_layers`); of a known light, they are drawn for each pixel (`light_layers`).
+
+The result has one layer for each part of the BRDF (see `transport`): first the diffuse part, one layer for
+each roughness if it depends on the roughness and else a single one, and then the facing and grazing parts at
+each roughness. `layers_of` has their indices.
 """
 
 from __future__ import annotations
@@ -15,19 +18,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from neilfpp_method.fields.direction_map import texels_of
+from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
-from neilfpp_method.fields.map_sampling import one_in_each_texel
 from neilfpp_method.lighting.lamp_transport import in_sight, lamp_kernel
 from neilfpp_method.lighting.rays import from_scene, trace_rays, unblocked
 from neilfpp_method.lighting.transport import Transport, kernel_of, spans
 from neilfpp_method.shading.brdf import Lobe, cosines
+from neilfpp_method.shading.frame import dot
 from neilfpp_method.shading.sampling import Technique, cosine, specular_lobe
-from neilfpp_method.structures import Observed, SceneTracer
+from neilfpp_method.structures import Observed, SceneLight, SceneTracer
 
 __all__ = [
     "LightLayers",
+    "SharedPoints",
     "diffuse_layers",
     "lamp_layers",
     "layers_at",
@@ -49,6 +53,23 @@ LOBE_ROUGHNESSES = (0.1, 0.3)
 
 
 @dataclass(frozen=True)
+class SharedPoints:
+    """P surface points, each shown by some of N pixels.
+
+    Attributes:
+        position: the points from which rays are traced, scene frame.
+        normal: their unit normals.
+        observed: the surface point that each pixel shows, for its normal and its direction to the viewer.
+        point: index of the point at which the rays of each pixel start.
+    """
+
+    position: Float[Tensor, "P 3"]
+    normal: Float[Tensor, "P 3"]
+    observed: Observed
+    point: Int[Tensor, " N"]
+
+
+@dataclass(frozen=True)
 class LightLayers:
     """The layers of outgoing radiance at N pixels.
 
@@ -63,21 +84,21 @@ class LightLayers:
 
 @torch.no_grad()
 def texel_layers(
-    height: int,
-    width: int,
-    observed: Observed,
+    environment: EnvironmentLight,
+    shared: SharedPoints,
     roughnesses: Sequence[float],
     lobe: Lobe,
     scene: SceneTracer | None,
 ) -> Transport:
     """The transport from the texels of a map at several roughnesses, per unit of radiance.
 
-    Within a texel radiance is constant. From each pixel's surface point one ray is traced to each texel above
-    the horizon, because the light is not known, and `LOBE_RAYS` in each lobe of `LOBE_ROUGHNESSES`.
+    One random direction per point and texel is traced, and what it hits occludes the whole texel. The BRDF of
+    each pixel is evaluated in another random direction within the texel, so that the pixels of a point have
+    independent errors.
 
     Args:
-        height, width: size of the map.
-        observed: the surface point that each pixel shows, with unit normals and directions to the viewer.
+        environment: the map; only its shape is used, not its radiance.
+        shared: the surface points and the pixels that show them.
         roughnesses: the values of roughness.
         lobe: the specular lobe.
         scene: as in `map_transport.from_texels`.
@@ -85,17 +106,64 @@ def texel_layers(
     Returns:
         The transport in layers; `sources` has half precision.
     """
-    texels, parts = height * width, []
-    for span in spans(len(observed), texels):
-        part = observed[span]
-        to_texels = one_in_each_texel(height, width, part.normal)
-        rays = trace_rays(part, [(to_texels, texels // 2), *_lobes(part, lobe)], scene)
-        kernel = _kernel_layers(part, rays.wi, rays.weight, roughnesses, lobe)
-        texel = texels_of(rays.wi, height, width).expand(len(kernel), -1, -1)
-        from_map = unblocked(kernel, rays.scene_light)
-        sources = kernel.new_zeros(*kernel.shape[:2], texels).scatter_add_(2, texel, from_map)
-        parts.append(Transport(sources.half(), from_scene(kernel, rays.scene_light)))
+    texels = environment.log_radiance[0].numel()
+    traced = [
+        _trace_texels(environment, shared.position[span], shared.normal[span], scene)
+        for span in spans(len(shared.position), texels)
+    ]
+    rays = _TexelRays.joined(traced)
+    parts = []
+    for span in spans(len(shared.observed), texels):
+        observed, of_point = shared.observed[span], rays[shared.point[span]]
+        drawn = environment.texel_directions(observed.position)
+        wi = drawn.wi.gather(1, of_point.texel[..., None].expand(-1, -1, 3))
+        weight = dot(wi, observed.normal).clamp_min(0) * drawn.solid_angle[of_point.texel]
+        kernel = _kernel_layers(observed, wi, weight, roughnesses, lobe)
+        sources = kernel.new_zeros(*kernel.shape[:2], texels, dtype=torch.half)
+        from_map = unblocked(kernel, of_point.scene_light).half()
+        sources.scatter_(2, of_point.texel.expand(len(kernel), -1, -1), from_map)
+        parts.append(Transport(sources, from_scene(kernel, of_point.scene_light)))
     return Transport.joined(parts)
+
+
+@dataclass(frozen=True)
+class _TexelRays:
+    """Rays from P points, one in each of the T texels above their horizons.
+
+    Attributes:
+        texel: index of the texel of each ray.
+        scene_light: the light that the rays meet in the scene, and which rays meet it; None without a scene.
+    """
+
+    texel: Int[Tensor, "P T"]
+    scene_light: SceneLight | None
+
+    @staticmethod
+    def joined(parts: Sequence[_TexelRays]) -> _TexelRays:
+        """The rays from the points of all parts."""
+        lights = [part.scene_light for part in parts]
+        scene_light = None if lights[0] is None else SceneLight.joined(lights)
+        return _TexelRays(torch.cat([part.texel for part in parts]), scene_light)
+
+    def __getitem__(self, points: Tensor) -> _TexelRays:
+        """The rays of some of the points."""
+        return _TexelRays(self.texel[points], None if self.scene_light is None else self.scene_light[points])
+
+
+def _trace_texels(
+    environment: EnvironmentLight,
+    position: Float[Tensor, "P 3"],
+    normal: Float[Tensor, "P 3"],
+    scene: SceneTracer | None,
+) -> _TexelRays:
+    """Trace one random direction in each texel above the horizon of each point."""
+    drawn = environment.texel_directions(position)
+    weight = dot(drawn.wi, normal).clamp_min(0) * drawn.solid_angle
+    # The texels are symmetric about the origin, so half of them lie above any horizon (up to those that the
+    # horizon cuts).
+    texel = weight.topk(len(drawn.solid_angle) // 2, dim=1).indices
+    wi = drawn.wi.gather(1, texel[..., None].expand(-1, -1, 3))
+    return _TexelRays(texel, None if scene is None else scene(position, wi))
 
 
 @torch.no_grad()
@@ -108,8 +176,8 @@ def light_layers(
 ) -> LightLayers:
     """The layers of outgoing radiance that a known map, known lamps and the scene cause.
 
-    Because the light is known, no transport matrix is needed, and rays are drawn where they matter. All
-    roughnesses share them.
+    Because the light is known, no transport matrix is needed, and the rays of each pixel are drawn where they
+    matter (`_techniques`). All roughnesses share them.
 
     Args:
         light: the map and the lamps.
@@ -122,9 +190,7 @@ def light_layers(
     parts = []
     for span in spans(len(observed), COSINE_RAYS + LIGHT_RAYS + LOBE_RAYS * len(LOBE_ROUGHNESSES)):
         part = observed[span]
-        to_light = environment.technique(part.normal) or cosine(part.normal)
-        techniques = [(cosine(part.normal), COSINE_RAYS), (to_light, LIGHT_RAYS), *_lobes(part, lobe)]
-        rays = trace_rays(part, techniques, scene)
+        rays = trace_rays(part, _techniques(environment, part, lobe), scene)
         kernel = _kernel_layers(part, rays.wi, rays.weight, roughnesses, lobe)
         radiance = environment.radiance(part.position, rays.wi)
         from_map = torch.einsum("kns,nsc->knc", unblocked(kernel, rays.scene_light), radiance)
@@ -136,13 +202,15 @@ def light_layers(
     return LightLayers(from_light, torch.cat([part.scene for part in parts], 1))
 
 
-def _lobes(observed: Observed, lobe: Lobe) -> list[tuple[Technique, int]]:
-    """Techniques that draw from lobes of `LOBE_ROUGHNESSES`, with the number of rays."""
+def _techniques(environment: EnvironmentLight, observed: Observed, lobe: Lobe) -> list[tuple[Technique, int]]:
+    """What draws the rays of each pixel, with the number of rays: the cosine, the light, and lobes."""
     normal, wo = observed.normal, observed.wo
-    return [
+    to_light = environment.technique(normal) or cosine(normal)
+    lobes = [
         (specular_lobe(normal, wo, torch.full_like(normal[:, :1], roughness), lobe), LOBE_RAYS)
         for roughness in LOBE_ROUGHNESSES
     ]
+    return [(cosine(normal), COSINE_RAYS), (to_light, LIGHT_RAYS), *lobes]
 
 
 def lamp_layers(

@@ -16,7 +16,6 @@ from neilfpp_method.effects.places.data import ROWS
 from neilfpp_method.effects.places.fit import Permitted, fit_places
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.fields.brdf import BrdfField
-from neilfpp_method.fields.direction_map import texel_solid_angles
 from neilfpp_method.lighting.solver import NothingToSolve
 from neilfpp_method.settings.facts import SceneFacts
 from neilfpp_method.settings.presets import preset
@@ -40,7 +39,7 @@ def patched(lobe: str) -> Places:
 def log_distance(log_radiance: torch.Tensor) -> float:
     """Mean error of the logarithm of the map, weighted by solid angle."""
     off = (log_radiance - sky().log_radiance).abs().mean(0).flatten()
-    weight = texel_solid_angles(*sky().log_radiance.shape[1:])
+    weight = sky().texel_directions(torch.zeros(1, 3)).solid_angle
     return ((off * weight).sum() / weight.sum()).item()
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from neilfpp_method.fields.direction_map import map_directions
+from neilfpp_method.fields.direction_map import map_directions, texels_of
 from neilfpp_method.fields.environment import EnvironmentLight
 
 
@@ -73,6 +73,16 @@ def test_samples_follow_the_density(bright):
     squares = (wi.square() * weight).mean((0, 1))
     assert squares.tolist() == pytest.approx([2 * math.pi / 3] * 3, rel=0.03)
     assert (wi * weight).mean((0, 1)).tolist() == pytest.approx([0.0, 0.0, math.pi], abs=0.05)
+
+
+def test_there_is_one_direction_in_every_texel_and_the_texels_cover_the_sphere():
+    light = EnvironmentLight(8, 1.0)
+    with torch.no_grad():
+        light.log_radiance.copy_(torch.arange(1.0, 129.0).log().view(1, 8, 16).expand(3, -1, -1))
+    drawn = light.texel_directions(torch.zeros(5, 3))
+    assert drawn.wi.shape == (5, 128, 3)
+    assert drawn.solid_angle.sum().item() == pytest.approx(4 * math.pi)
+    assert torch.equal(texels_of(drawn.wi, 8, 16), torch.arange(128).expand(5, -1))
 
 
 # ---------------------------------------------------------------------------------------- maps that are known

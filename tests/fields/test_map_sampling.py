@@ -20,11 +20,10 @@ from neilfpp_method.fields.direction_map import (
     polar_cosines,
     texel_centers,
     texel_solid_angles,
-    texels_of,
     weights_linear_in_cosine,
 )
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.fields.map_sampling import one_in_each_texel, radiance_times_cosine
+from neilfpp_method.fields.map_sampling import radiance_times_cosine
 from neilfpp_method.shading.sampling import Technique
 
 SIZES = [(2, 4), (16, 32), (33, 50), (48, 96), (60, 31)]
@@ -163,19 +162,6 @@ def test_irradiance_has_little_noise(stochastic):
     assert error.abs().median() < 0.02
     assert error.square().mean().sqrt() < 0.05
     assert error.mean().abs() < 5e-3
-
-
-def test_each_texel_above_the_horizon_has_one_direction_of_its_density():
-    normal = normalize(torch.tensor([[0.2, -0.4, 0.9], [0.0, 0.0, 1.0], [-1.0, 0.1, -0.1]]), dim=-1)
-    height, width = 12, 24
-    technique = one_in_each_texel(height, width, normal)
-    wi = technique.draw(height * width // 2, True)
-    texel = texels_of(wi, height, width)
-    assert all(len(row.unique()) == height * width // 2 for row in texel)
-    # Only texels that the horizon cuts may have a direction below it.
-    assert (wi * normal[:, None]).sum(-1).min() > -0.3
-    solid_angle = texel_solid_angles(height, width)[texel]
-    torch.testing.assert_close(technique.pdf(wi) * solid_angle, torch.full_like(solid_angle, 2 / 288))
 
 
 def test_a_large_map_costs_as_little_as_a_small_one():

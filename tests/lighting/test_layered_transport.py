@@ -11,7 +11,7 @@ from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.fields.light import LightModel
 from neilfpp_method.lighting.lamp_transport import from_lamps
-from neilfpp_method.lighting.layered_transport import layers_at, light_layers, texel_layers
+from neilfpp_method.lighting.layered_transport import SharedPoints, layers_at, light_layers, texel_layers
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.shading.brdf import GGX, GGX_BURLEY
 from tests.lighting.surfaces import half_room, points
@@ -21,16 +21,22 @@ PIXELS = 40
 lobes = pytest.mark.parametrize("lobe", [GGX, GGX_BURLEY], ids=["one diffuse layer", "one per roughness"])
 
 
+def shared_points() -> SharedPoints:
+    """Each pixel shows a point of its own."""
+    observed = points(PIXELS)
+    return SharedPoints(observed.position, observed.normal, observed, torch.arange(PIXELS))
+
+
 @lobes
 def test_the_layers_of_a_map_agree_with_each_roughness_alone(lobe):
-    environment, observed = EnvironmentLight(48, 1.0), points(PIXELS)
+    environment, shared = EnvironmentLight(48, 1.0), shared_points()
     torch.manual_seed(3)
-    draws = [texel_layers(48, 96, observed, ROUGHNESSES, lobe, None) for _ in range(16)]
+    draws = [texel_layers(environment, shared, ROUGHNESSES, lobe, None) for _ in range(16)]
     layers = torch.stack([drawn.sources.float() for drawn in draws]).mean(0)
     for number, value in enumerate(ROUGHNESSES):
         roughness = torch.full((PIXELS, 1), value)
         alone = torch.stack(
-            [from_texels(environment, observed, roughness, lobe, None).sources for _ in range(16)]
+            [from_texels(environment, shared.observed, roughness, lobe, None).sources for _ in range(16)]
         ).mean(0)
         found = layers_at(layers, torch.full((PIXELS,), number), len(ROUGHNESSES))
         # Summed over the texels: single ones are noisy.

@@ -15,8 +15,10 @@ from torch import Tensor
 from neilfpp_method.data.cameras.projection import pixel_index, project
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.fields.exposure import at_mean_exposure
+from neilfpp_method.lighting.layered_transport import SharedPoints
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.color import CLIPPED, srgb_to_linear
+from neilfpp_method.shading.frame import safe_normalize
 from neilfpp_method.structures import Observed, OrientedPoints
 
 __all__ = ["Places", "Split", "gather_places"]
@@ -56,11 +58,6 @@ class Places:
     place: Int[Tensor, " N"]
     view: Int[Tensor, " N"]
     observed: Observed
-
-    @property
-    def position(self) -> Float[Tensor, "P 3"]:
-        """Position of each place: the mean of the points that its pixels show."""
-        return self.mean(self.observed.position)
 
     @property
     def shown_count(self) -> int:
@@ -106,6 +103,11 @@ class Places:
         """
         is_held_back = self.view % folds == fold
         return Split(torch.nonzero(~is_held_back)[:, 0], torch.nonzero(is_held_back)[:, 0])
+
+    def shared_points(self) -> SharedPoints:
+        """One point per place, the mean of the points that its pixels show, from which rays are traced."""
+        position, normal = self.mean(self.observed.position), self.mean(self.observed.normal)
+        return SharedPoints(position, safe_normalize(normal), self.observed, self.place)
 
 
 @torch.no_grad()

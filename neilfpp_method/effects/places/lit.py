@@ -113,7 +113,7 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
             left out of the result.
     """
     places, seed = places.only_shown(), int(torch.randint(2**31, ()))
-    position = places.position
+    position = places.shared_points().position
     look = COLOR_SCALE * model.brdf(position).base_color.clamp_min(DARK_FLOOR).log()
     near = neighbors(torch.cat((position, look), -1), NEIGHBORS_SHARE)
     layers = _layers(model, places, model.lobe, seed)

@@ -60,7 +60,7 @@ def correct_scale(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> Res
         The places under the changed light; None if the scale is known (`LightSolver.scale_is_free`), or if so
         many places are metal that no reflection reveals it.
     """
-    current = model.brdf(lit.places.position)
+    current = model.brdf(lit.places.shared_points().position)
     if not solver.scale_is_free or (current.metallic > 0.5).float().mean() >= MIN_METAL_SHARE:
         return None
     mean = current.base_color.clamp_min(DARK_FLOOR).log().mean().exp().item()

@@ -49,7 +49,7 @@ last correction. The training of the field on what a search finds would need mor
 """
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
-pixels (measured on `spot_city`: 22 of 105 s; on `tabletop_env` with fewer rays: 9 of 44 s).
+pixels (measured on `spot_city`: 22 of 105 s; on `tabletop_env` with fewer rays: 4 of 25 s).
 """
 MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
@@ -125,7 +125,7 @@ def search_materials(brdf: BrdfField, lit: LitPlaces) -> SearchedMaterial:
     Returns:
         Materials at the points that the pixels show.
     """
-    current = brdf(lit.places.position)
+    current = brdf(lit.places.shared_points().position)
     loss, roughness = lit.loss(current), current.roughness[:, 0]
     paint, metal = lit.best(PAINT), lit.best(METAL)
     best = metal.where(metal.loss < paint.loss, paint)

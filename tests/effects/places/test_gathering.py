@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from neilfpp_method.effects.places.data import ROWS, place_transport
+from neilfpp_method.effects.places.data import DIRECTIONS, ROWS, place_transport
 from neilfpp_method.effects.places.gathering import Places
-from neilfpp_method.lighting.layered_transport import LOBE_RAYS, LOBE_ROUGHNESSES
 from neilfpp_method.shading import LOBES
 from neilfpp_method.structures import Observed, SceneLight
 from tests.effects.balls import ball
@@ -34,7 +33,7 @@ def test_selected_places_all_have_pixels():
     assert places.only_shown().count == places.shown_count == 3
 
 
-def test_rays_are_traced_from_every_pixel():
+def test_rays_are_traced_once_per_place():
     one = torch.ones(40, 1)
     places = ball(0.5 * one.expand(-1, 3), 0.28 * one, 0 * one, LOBE)
     rays = []
@@ -45,7 +44,7 @@ def test_rays_are_traced_from_every_pixel():
         return SceneLight(up, up[..., None] * torch.ones(3), torch.where(up, 1.0, torch.inf))
 
     transport = place_transport(places, LOBE, scene)
-    assert sum(rays) == len(places.place) * (ROWS**2 + len(LOBE_ROUGHNESSES) * LOBE_RAYS)
+    assert sum(rays) == DIRECTIONS * places.count * ROWS**2
     open_sky = place_transport(places, LOBE, None)
     assert transport.sources.sum() < open_sky.sources.sum()
     assert (transport.scene[0] > 0).any()
