@@ -146,8 +146,7 @@ def fit_light(start: MapAndLamps, transport: Transport, target: Target, objectiv
     is_reachable = reach > MIN_REACH * reach.mean()
     first = FIRST_SHARE / max(1, len(reach))
     root = (start.intensity * reach).clamp_min(first).sqrt().requires_grad_()
-    # Sources that are visible from no point are left out of the sums: half of the texels for a table top.
-    reaching_any = torch.nonzero(transport.sources.amax((0, 1)))[:, 0]
+    reaching_any = transport.reaching_any()
     is_visible = _visible_share(transport.sources[0], start.log_radiance) > MIN_VISIBLE_SHARE
     set_by_images = is_visible[reaching_any, None]
     transport = transport.select_sources(reaching_any)

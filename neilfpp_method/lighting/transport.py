@@ -66,6 +66,10 @@ class Transport:
         """The transport via some of the points."""
         return Transport(self.sources[:, points], self.scene[:, points])
 
+    def reaching_any(self) -> Int[Tensor, " U"]:
+        """Numbers of the sources that reach any point. Half of the texels of a map reach no table top."""
+        return torch.nonzero(self.sources.amax((0, 1)))[:, 0]
+
     def select_sources(self, sources: Int[Tensor, " U"]) -> Transport:
         """The transport from some of the sources."""
         return Transport(self.sources[..., sources], self.scene)

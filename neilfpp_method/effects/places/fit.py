@@ -177,8 +177,7 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
     # The base colour of a place without pixels is arbitrary.
     with_pixels = place.unique()
     selected = _at_roughness(data.transport, fit.roughness[place])
-    # Texels that are visible from no place, such as those below a table, are left out of the sums.
-    reaching_any = torch.nonzero(selected.sources.amax((0, 1)))[:, 0]
+    reaching_any = selected.reaching_any()
     selected = selected.select_sources(reaching_any)
     material = fit.material(place)
     mean_transport = selected.sources[0].mean(0)
