@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 
 __all__ = ["main"]
+
+SPIN_COUNT = "1000"
+"""Checks of a waiting OpenMP thread before it sleeps (`GOMP_SPINCOUNT` of GNU's OpenMP library, which torch
+uses on Linux). By default a thread spins for milliseconds. On a machine with other work it uses up its time
+slice in this way, and the other threads of this process then wait for it.
+"""
 
 
 def main() -> int:
@@ -14,6 +21,8 @@ def main() -> int:
     Ctrl-C and SIGTERM wait until the command handles them (`commands.ending`). After the command, while
     Python ends, they end the process without a traceback.
     """
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)  # read when torch is imported
     if not hasattr(signal, "pthread_sigmask"):  # Windows has no signal masks
         from neilfpp_method.cli import main as run
 
