@@ -154,6 +154,13 @@ def test_no_untrusted_file_is_unpickled(source):
             assert safe == "True", "torch.load runs what a file says unless weights_only=True"
 
 
+def test_trees_are_made_in_one_place(source):
+    module, tree = source
+    if module != f"{PACKAGE}.data.kd_tree":
+        made = [name for name, _ in calls(tree) if name.split(".")[-1] in ("KDTree", "cKDTree")]
+        assert not made, "use data.kd_tree: a tree of SciPy's defaults may overflow the stack in commands"
+
+
 def test_the_top_level_has_few_modules():
     top = {path.name for path in ROOT.glob("*.py")} - {"__init__.py"}
     assert len(top) <= MAX_AT_THE_TOP, sorted(top)

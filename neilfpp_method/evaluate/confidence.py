@@ -22,11 +22,11 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
 from neilfpp_method.data.cameras.projection import camera_rays
+from neilfpp_method.data.kd_tree import kd_tree
 from neilfpp_method.evaluate.outgoing import radiance_parts, sent_by_patch
 from neilfpp_method.evaluate.patches import PATCHES, by_patch, light_by_patch, patch_count
 from neilfpp_method.evaluate.posterior import Deviation, Observations, expected_error, prior_error
@@ -230,7 +230,7 @@ def _smoothed(
     continuous field: views of neighbouring points constrain a point that its own views do not.
     """
     places = coordinates(position, normal)
-    nearest = cKDTree(places).query(places, k=range(1, 1 + NEIGHBORS), distance_upper_bound=NEAR)[1]
+    nearest = kd_tree(places).query(places, k=range(1, 1 + NEIGHBORS), distance_upper_bound=NEAR)[1]
     # If a point has fewer neighbours, the tree returns the index after the last row; that row is padded
     # with NaN here, which nanmedian ignores.
     values = (

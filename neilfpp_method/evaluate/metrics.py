@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
 from skimage.metrics import structural_similarity
+
+from neilfpp_method.data.kd_tree import kd_tree
 
 __all__ = [
     "LOG_FLOOR",
@@ -188,7 +189,7 @@ def chamfer(estimate: Float[np.ndarray, "P 3"], truth: Float[np.ndarray, "Q 3"])
 
 def _mean_distance(points: Float[np.ndarray, "P 3"], surface: Float[np.ndarray, "Q 3"]) -> float:
     queries = points[:: max(1, len(points) // QUERIES)]
-    return float(cKDTree(surface).query(queries)[0].mean())
+    return float(kd_tree(surface).query(queries)[0].mean())
 
 
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int = 0) -> Float[np.ndarray, "count 3"]:

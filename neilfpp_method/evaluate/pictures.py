@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import cKDTree
 
+from neilfpp_method.data.kd_tree import kd_tree
 from neilfpp_method.drawing.ink import PAPER
 from neilfpp_method.shading.color import luminance, tone_map
 
@@ -93,7 +93,7 @@ def nearest_radiance(
     wi: Float[np.ndarray, "S 3"], radiance: Float[np.ndarray, "S 3"], directions: Float[np.ndarray, "H W 3"]
 ) -> Float[np.ndarray, "H W 3"]:
     """Look up radiance that is known along `wi` in other directions, by the nearest neighbour."""
-    return radiance[cKDTree(wi).query(directions.reshape(-1, 3))[1]].reshape(directions.shape)
+    return radiance[kd_tree(wi).query(directions.reshape(-1, 3))[1]].reshape(directions.shape)
 
 
 def ring(

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial import cKDTree
 
 from neilfpp_method.data.cameras.colmap_library import pycolmap
+from neilfpp_method.data.kd_tree import kd_tree
 from neilfpp_method.data.point_cloud import WorldPoints
 
 __all__ = ["SparsePoints", "estimate_normals", "oriented", "reliable", "sparse_points", "without_outliers"]
@@ -120,7 +120,7 @@ def estimate_normals(
         position: at least `NEIGHBORS` + 1 points.
         towards: for each point a direction; its normal has a non-negative dot product with it.
     """
-    neighbors = cKDTree(position).query(position, k=NEIGHBORS + 1)[1]
+    neighbors = kd_tree(position).query(position, k=NEIGHBORS + 1)[1]
     spread = position[neighbors] - position[neighbors].mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("pki,pkj->pij", spread, spread))
     normal = vectors[:, :, 0]
@@ -136,7 +136,7 @@ def _not_isolated(position: Float64[np.ndarray, "P 3"]) -> Bool[np.ndarray, " P"
     """
     if len(position) <= NEIGHBORS:
         return np.ones(len(position), dtype=bool)
-    distances = cKDTree(position).query(position, k=NEIGHBORS + 1)[0][:, 1:]
+    distances = kd_tree(position).query(position, k=NEIGHBORS + 1)[0][:, 1:]
     log_distance = np.log(np.maximum(distances.mean(axis=1), 1e-12))
     median = np.median(log_distance)
     deviation = MAD_TO_SIGMA * np.median(np.abs(log_distance - median))

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from neilfpp_method.data.kd_tree import kd_tree
 from neilfpp_method.evaluate.confidence import coordinates, deviations_at
 from neilfpp_method.relight.surface import Surface
 from neilfpp_method.shading.frame import safe_normalize
@@ -59,7 +60,7 @@ def expected_errors(run: Run, surface: Surface) -> ExpectedErrors:
         UserError: a training view cannot be read.
     """
     points = points_on(surface, POINTS)
-    return ExpectedErrors(cKDTree(coordinates(points.position, points.normal)), deviations_at(run, points))
+    return ExpectedErrors(kd_tree(coordinates(points.position, points.normal)), deviations_at(run, points))
 
 
 def points_on(surface: Surface, count: int) -> OrientedPoints:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
+
+from neilfpp_method.data.kd_tree import kd_tree
 
 __all__ = ["capped_mean", "surface_samples", "thinned"]
 
@@ -51,7 +52,7 @@ def thinned(points: Float[np.ndarray, "P 3"], spacing: float, seed: int) -> Floa
     """
     order = np.random.default_rng(seed).permutation(len(points))
     shuffled = points[order]
-    tree = cKDTree(shuffled)
+    tree = kd_tree(shuffled)
     kept: Bool[np.ndarray, " P"] = np.ones(len(points), bool)
     for begin in range(0, len(points), POINTS_AT_ONCE):
         neighbors = tree.query_ball_point(shuffled[begin : begin + POINTS_AT_ONCE], spacing)
@@ -69,6 +70,6 @@ def capped_mean(
 
     None if there is no such point.
     """
-    distance = cKDTree(surface).query(points)[0]
+    distance = kd_tree(surface).query(points)[0]
     near = distance[distance < cap]
     return float(near.mean()) if len(near) else None

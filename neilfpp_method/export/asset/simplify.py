@@ -9,9 +9,9 @@ import fast_simplification
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from neilfpp_method.data.kd_tree import kd_tree
 from neilfpp_method.export.asset.surface import AssetSurface, creased, first_hits, hits_along_normals
 
 __all__ = ["MAX_FACES", "MIN_FACES", "Distance", "Simplified", "decimated", "distance_between", "simplified"]
@@ -129,7 +129,7 @@ def _to_nearest(
     # size is searched for itself, because the radius of a large triangle would bring in many small ones.
     size = np.frexp(radius)[1]
     for faces in (np.flatnonzero(size == one) for one in np.unique(size)):
-        tree, reach = cKDTree(center[faces]), (distances + radius[faces].max()) * (1 + 1e-9)
+        tree, reach = kd_tree(center[faces]), (distances + radius[faces].max()) * (1 + 1e-9)
         pairs = np.cumsum(tree.query_ball_point(points[rows], reach[rows], return_length=True))
         for some in np.split(rows, np.flatnonzero(np.diff(pairs // PAIRS_AT_ONCE)) + 1):
             within = tree.query_ball_point(points[some], reach[some])
@@ -156,7 +156,7 @@ def _to_center(
         points: the points.
         normals: unit normals of the points.
     """
-    distance, near = cKDTree(center).query(points, range(1, min(NEIGHBORS, len(center)) + 1))
+    distance, near = kd_tree(center).query(points, range(1, min(NEIGHBORS, len(center)) + 1))
     same = np.einsum("nki,ni->nk", facing[near], normals) > 0
     distances = np.where(same, distance, np.inf).min(1)
     left, at_once = np.flatnonzero(np.isinf(distances)), max(1, PAIRS_AT_ONCE // len(center))
