@@ -30,9 +30,9 @@ from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import Material
 
 __all__ = [
+    "COMPARE_AT",
     "SEARCH_AT",
     "SEARCH_SHARE",
-    "SETTLED_AT",
     "SearchedMaterial",
     "found_in",
     "is_comparison_due",
@@ -41,11 +41,14 @@ __all__ = [
     "teach",
 ]
 
+COMPARE_AT = (0.1, 1 / 3, 2 / 3, 0.9)
+"""Shares of material init after which the scale is corrected. The first correction follows the first fits
+with lamps: the initial light has none, and can be twice too strong. Surfaces that learn under such a light
+become rough, so that its highlights do not show, and stay rough. Before the last one the light has settled.
+"""
 SEARCH_AT = (1 / 3, 2 / 3)
-"""Shares of material init after which materials are searched."""
-SETTLED_AT = 0.9
-"""Share of material init after which only the scale is corrected, under a light that has settled since the
-last correction. The training of the field on what a search finds would need more steps than are left.
+"""Those of them after which materials are searched, too. Before, the field has not learned its materials yet;
+after the last one, too few steps are left in which it could learn what a search finds.
 """
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
@@ -101,7 +104,7 @@ def is_comparison_due(model: NeilfModel, position: StagePosition) -> bool:
     """
     if model.lobe is None or not isinstance(model.light, EnvironmentLight):
         return False
-    return position.stage is Stage.MATERIAL_INIT and _has_reached(position, (*SEARCH_AT, SETTLED_AT))
+    return position.stage is Stage.MATERIAL_INIT and _has_reached(position, COMPARE_AT)
 
 
 def is_search_due(position: StagePosition) -> bool:

@@ -11,8 +11,7 @@ import torch
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.places.search import (
-    SEARCH_AT,
-    SETTLED_AT,
+    COMPARE_AT,
     SearchedMaterial,
     is_comparison_due,
     is_search_due,
@@ -119,12 +118,12 @@ def due_after(model: NeilfModel, length: int) -> list[int]:
 
 def test_a_comparison_is_due_once_at_each_of_its_times():
     model = sphere_model(preset("fast"))
-    for length in (3, 7, 1500):
-        assert due_after(model, length) == [math.ceil(share * length) for share in (*SEARCH_AT, SETTLED_AT)]
+    for length in (10, 17, 1500):
+        assert due_after(model, length) == [math.ceil(share * length) for share in COMPARE_AT]
     assert not any(is_comparison_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
 
 
-def test_the_last_comparison_is_of_the_scale_only():
+def test_the_first_and_the_last_comparison_are_of_the_scale_only():
     positions = [StagePosition(Stage.MATERIAL_INIT, n, 1500) for n in range(1, 1501)]
     assert [position.step for position in positions if is_search_due(position)] == [500, 1000]
 
