@@ -198,7 +198,7 @@ class Improved:
 def improve_material(
     model: NeilfModel, solver: LightSolver, places: Places, with_search: bool
 ) -> Improved | None:
-    """Correct the scale of a half-trained model, and replace metal by paint where paint is better.
+    """Correct the scale of a half-trained model, and its material where training is stuck (`places.search`).
 
     Args:
         model: its light is an environment map; see `places.search.is_comparison_due`.
@@ -216,12 +216,11 @@ def improve_material(
     if rescaled is not None:
         lit = rescaled.lit
         summaries.append(rescaled.summary())
-    if with_search and model.brdf.metals:
+    if with_search and (model.brdf.metals or model.brdf.varying_roughness):
         searched = search_materials(model.brdf, lit)
         if searched.share > 0:
             teach(model.brdf, searched)
-        paint = f"{searched.share:.0%} of the places are paint that was taken for metal"
-        summaries.append(f"material search: {paint}")
+        summaries.append(f"material search: {searched.share:.0%} of the places become another paint")
     return Improved(lit, summaries)
 
 

@@ -1,9 +1,9 @@
 """Correct the scale between light and base colour under the light of a half-trained model.
 
 The scale of the initial light (`effects.light_scale`) is off by up to a quarter, because its coarse map blurs
-the highlights that reveal it, and in a scene with lamps by more, because it has none. The light of a
-half-trained model is sharper and has lamps. So it is divided by several factors, the best material of each
-place is found under each of these lights, and held-back views select the factor.
+the highlights that reveal it. The map of a half-trained model is sharper. So the light is divided by several
+factors, the best material of each place is found under each of these lights, and held-back views select the
+factor.
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ from neilfpp_method.model import NeilfModel
 __all__ = ["FACTORS", "Rescaled", "correct_scale"]
 
 FACTORS = (0.59, 0.7, 0.84, 1.0, 1.19, 1.41, 1.68)
-"""Factors on base colour that are tried, in equal steps of the logarithm. A scale that is off by more takes
-two corrections.
-"""
+"""Factors on base colour that are tried, in equal steps of the logarithm. Initial scales are off by less."""
 FOLDS = 5
 """Number of folds of the views. Each of them is held back once."""
 

@@ -1,14 +1,18 @@
-"""Search for paint that training has taken for metal, under the current light.
+"""Search for paint at which training is stuck, under the current light.
 
 Gradient descent cannot change a dark metal into a black paint: halfway between the two, the error is larger
 than at both ends. Under the light of a half-trained model it is easy to see which of the two explains the
 views better, so every roughness and metallic of a grid is tried at some thousand places. The BRDF field is
 then trained to be paint where paint is better, and to keep its values everywhere else.
 
+The roughness of paint can be stuck as well. The initial light has no lamps, and in a room with lamps it was
+twice too strong. Paint that learned under it was rough, so that its highlights did not show, and stayed rough
+when the light had its right scale: a slightly narrower highlight still does not resemble that of the images.
+
 A rough metal reflects almost like matte paint, which is far more common. It also becomes paint if a metal is
 only slightly better than paint. On photographs of a castle, half of the surface was rough metal otherwise.
 
-The opposite change is not made: of 18 places of two scenes at which a search found metal in place of paint,
+Paint does not become metal: of 18 places of two scenes at which a search found metal in place of paint,
 one was metal, whereas 87 % of the changes to paint were right.
 """
 
@@ -30,9 +34,9 @@ from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.structures import Material
 
 __all__ = [
-    "COMPARE_AT",
     "SEARCH_AT",
     "SEARCH_SHARE",
+    "SETTLED_AT",
     "SearchedMaterial",
     "found_in",
     "is_comparison_due",
@@ -41,14 +45,11 @@ __all__ = [
     "teach",
 ]
 
-COMPARE_AT = (0.1, 1 / 3, 2 / 3, 0.9)
-"""Shares of material init after which the scale is corrected. The first correction follows the first fits
-with lamps: the initial light has none, and can be twice too strong. Surfaces that learn under such a light
-become rough, so that its highlights do not show, and stay rough. Before the last one the light has settled.
-"""
 SEARCH_AT = (1 / 3, 2 / 3)
-"""Those of them after which materials are searched, too. Before, the field has not learned its materials yet;
-after the last one, too few steps are left in which it could learn what a search finds.
+"""Shares of material init after which materials are searched."""
+SETTLED_AT = 0.9
+"""Share of material init after which only the scale is corrected, under a light that has settled since the
+last correction. The training of the field on what a search finds would need more steps than are left.
 """
 SEARCH_SHARE = 0.2
 """Time of a search as a share of that of the search for the initial light, with all its evidence, at the same
@@ -57,9 +58,11 @@ pixels (measured on `spot_city`: 22 of 105 s; on `tabletop_env` with fewer rays:
 MAX_RATIO = 0.8
 """A material replaces that of the field if its error is at most this share of the error of the field."""
 MIN_CHANGE = 0.5
-"""A material replaces that of the field only if its metallic is lower by at least this much. Smaller
-differences, and those of roughness alone, are not local optima, and the field is more exact than the grid.
+"""Smallest decrease of metallic by which metal becomes paint. Smaller differences are not local optima, and
+the field is more exact than the grid. A field whose metallic is less than this has paint there.
 """
+MIN_ROUGHNESS_CHANGE = 0.3
+"""Smallest change of log roughness by which paint gets another roughness: one to two steps of the grid."""
 MIN_LOSS = 0.005
 """Loss of the field below which its material is kept: that of relative errors of 3 %, which the steps of the
 grid cause as well.
@@ -104,7 +107,7 @@ def is_comparison_due(model: NeilfModel, position: StagePosition) -> bool:
     """
     if model.lobe is None or not isinstance(model.light, EnvironmentLight):
         return False
-    return position.stage is Stage.MATERIAL_INIT and _has_reached(position, COMPARE_AT)
+    return position.stage is Stage.MATERIAL_INIT and _has_reached(position, (*SEARCH_AT, SETTLED_AT))
 
 
 def is_search_due(position: StagePosition) -> bool:
@@ -119,7 +122,7 @@ def _has_reached(position: StagePosition, shares: tuple[float, ...]) -> bool:
 
 @torch.no_grad()
 def search_materials(brdf: BrdfField, lit: LitPlaces) -> SearchedMaterial:
-    """Search for paint that was taken for metal, under the current light of a model.
+    """Search for paint at which training is stuck, under the current light of a model.
 
     Args:
         brdf: gives the current materials.
@@ -129,14 +132,23 @@ def search_materials(brdf: BrdfField, lit: LitPlaces) -> SearchedMaterial:
         Materials at the points that the pixels show.
     """
     current = brdf(lit.places.shared_points().position)
-    loss, roughness = lit.loss(current), current.roughness[:, 0]
+    loss, roughness, metallic = lit.loss(current), current.roughness[:, 0], current.metallic[:, 0]
+    best = _paint_or_metal(lit, roughness) if brdf.metals else lit.best(PAINT)
+    material = best.material
+    is_better = (loss > MIN_LOSS) & (best.loss < MAX_RATIO * loss)
+    was_metal = (metallic - material.metallic[:, 0] >= MIN_CHANGE) & (roughness >= MIN_METAL_ROUGHNESS)
+    stays_paint = (metallic < MIN_CHANGE) & (best.metallic == 0)
+    has_turned = (material.roughness[:, 0] / roughness).log().abs() >= MIN_ROUGHNESS_CHANGE
+    was_stuck = stays_paint & has_turned & brdf.varying_roughness
+    return found_in(lit, brdf, best, is_better & (was_metal | was_stuck))
+
+
+def _paint_or_metal(lit: LitPlaces, roughness: Float[Tensor, " P"]) -> BestMaterials:
+    """The best material of each place; where the field is rough, paint even if metal is slightly better."""
     paint, metal = lit.best(PAINT), lit.best(METAL)
     best = metal.where(metal.loss < paint.loss, paint)
     is_matte = (roughness >= MATTE_ROUGHNESS) & (paint.loss < MATTE_RATIO * best.loss)
-    chosen = best.where(~is_matte, paint)
-    is_other = (current.metallic - chosen.material.metallic)[:, 0] >= MIN_CHANGE
-    is_judged = (roughness >= MIN_METAL_ROUGHNESS) & (loss > MIN_LOSS)
-    return found_in(lit, brdf, chosen, is_other & is_judged & (chosen.loss < MAX_RATIO * loss))
+    return best.where(~is_matte, paint)
 
 
 @torch.no_grad()
