@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.search import Comparison
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     LightReview,
@@ -75,21 +76,21 @@ def start_light(followers: Followers, review: LightReview, step: int) -> Evidenc
     return evidence
 
 
-def improve(followers: Followers, places: Places, with_search: bool, step: int) -> None:
+def improve(followers: Followers, places: Places, comparison: Comparison, step: int) -> None:
     """Correct the scale of a half-trained model, and review metals and the diffuse lobe (`review`).
 
     Args:
         followers: what follows; the light may change, and the BRDF field may be trained.
         places: places in the training views, with linear radiance.
-        with_search: whether to search for paint, and to review effects; without, only the scale is corrected.
+        comparison: what is compared; effects are reviewed together with material.
         step: number of steps trained so far.
     """
-    improved = improve_material(followers.model, followers.light_solver, places, with_search)
+    improved = improve_material(followers.model, followers.light_solver, places, comparison)
     if improved is None:
         return
     for summary in improved.summaries:
         followers.say(summary)
-    if with_search:
+    if comparison is Comparison.MATERIAL:
         plan, model = followers.plan, followers.model
         follow(followers, review_metals(plan, model, improved.lit, step))
         follow(followers, review_diffuse(plan, model, improved.lit, step))

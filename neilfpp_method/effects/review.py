@@ -24,8 +24,8 @@ from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_firs
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.places.gathering import Places, gather_places
 from neilfpp_method.effects.places.lit import LitPlaces, light_up
-from neilfpp_method.effects.places.rescaling import correct_scale
-from neilfpp_method.effects.places.search import search_materials, teach
+from neilfpp_method.effects.places.rescaling import BRIGHTER, FACTORS, correct_scale
+from neilfpp_method.effects.places.search import Comparison, search_materials, teach
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
 from neilfpp_method.lighting.solver import LightSolver
@@ -196,15 +196,15 @@ class Improved:
 
 
 def improve_material(
-    model: NeilfModel, solver: LightSolver, places: Places, with_search: bool
+    model: NeilfModel, solver: LightSolver, places: Places, comparison: Comparison
 ) -> Improved | None:
-    """Correct the scale of a half-trained model, and its material where training is stuck (`places.search`).
+    """Correct the scale of a half-trained model, and replace metal by paint where paint is better.
 
     Args:
-        model: its light is an environment map; see `places.search.is_comparison_due`.
+        model: its light is an environment map; see `places.search.comparison_due`.
         solver: keeps the scale in later fits of the light.
         places: places in the training views, with linear radiance.
-        with_search: whether to search for paint; without, only the scale is corrected.
+        comparison: what is compared.
 
     Returns:
         None if there are fewer than `MIN_PLACES` places.
@@ -212,15 +212,17 @@ def improve_material(
     if places.shown_count < MIN_PLACES:
         return None
     lit, summaries = light_up(model, places), []
-    rescaled = correct_scale(model, solver, lit)
+    factors = BRIGHTER if comparison is Comparison.WEAKER_LIGHT else FACTORS
+    rescaled = correct_scale(model, solver, lit, factors)
     if rescaled is not None:
         lit = rescaled.lit
         summaries.append(rescaled.summary())
-    if with_search and (model.brdf.metals or model.brdf.varying_roughness):
+    if comparison is Comparison.MATERIAL and model.brdf.metals:
         searched = search_materials(model.brdf, lit)
         if searched.share > 0:
             teach(model.brdf, searched)
-        summaries.append(f"material search: {searched.share:.0%} of the places become another paint")
+        paint = f"{searched.share:.0%} of the places are paint that was taken for metal"
+        summaries.append(f"material search: {paint}")
     return Improved(lit, summaries)
 
 
@@ -231,7 +233,7 @@ def review_metals(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> l
 
     Args:
         plan: the plan to which the decision is added.
-        model: its light is an environment map; see `places.search.is_comparison_due`.
+        model: its light is an environment map; see `places.search.comparison_due`.
         lit: places under this light.
         step: number of steps trained so far.
 
@@ -255,7 +257,7 @@ def review_diffuse(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> 
 
     Args:
         plan: the plan to which the decision is added.
-        model: its light is an environment map; see `places.search.is_comparison_due`.
+        model: its light is an environment map; see `places.search.comparison_due`.
         lit: places under this light, with the lobe of the model.
         step: number of steps trained so far.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.effects.following import Followers, follow, improve, start_light
-from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
+from neilfpp_method.effects.places.search import comparison_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
@@ -71,7 +71,7 @@ def review_before_material(subject: Subject, step: int) -> Evidence | None:
 
 def is_improvement_due(subject: Subject, position: StagePosition) -> bool:
     """Whether `improve_half_trained` is due after `position.step` steps of a stage."""
-    return subject.max_pixels >= MIN_PIXELS and is_comparison_due(subject.model, position)
+    return subject.max_pixels >= MIN_PIXELS and comparison_due(subject.model, position) is not None
 
 
 def improve_half_trained(subject: Subject, position: StagePosition, step: int) -> None:
@@ -85,12 +85,15 @@ def improve_half_trained(subject: Subject, position: StagePosition, step: int) -
         step: number of steps trained so far in all stages.
     """
     model, solver = subject.model, subject.light_solver
+    comparison = comparison_due(model, position)
+    if comparison is None:
+        return
     is_reviewed = any(subject.plan.is_open(name) for name in ("metals", "rough-diffuse"))
     if not (model.brdf.metals or is_reviewed or solver.scale_is_free):
         return
     seed_stream(subject.seed, Stream.SEARCH, step)
     places = light_places(model, subject.pixels, subject.max_pixels)
-    improve(subject, places, is_search_due(position), step)
+    improve(subject, places, comparison, step)
 
 
 def _review(subject: Subject, step: int, review: Review, stream: Stream) -> None:

@@ -21,7 +21,7 @@ from neilfpp_method.data.scaling import PIXELS_OF_A_VIEW, at_scale, scale_for_pi
 from neilfpp_method.data.views import View
 from neilfpp_method.effects.evidence.material import EFFECTS_AT_PLACES, seconds_of_evidence
 from neilfpp_method.effects.first_light import seconds_of_pixel
-from neilfpp_method.effects.places.search import SEARCH_AT, SEARCH_SHARE, SETTLED_AT
+from neilfpp_method.effects.places.search import COMPARISONS, SEARCH_SHARE
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import EffectRequest
 from neilfpp_method.effects.review import (
@@ -221,11 +221,8 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     costs, times = {}, _StageTimes()
     for stage, steps in lengths.items():
         times = _measure_stage(setup, stage, limits.steps / len(lengths), limits.check_time)
-        searches = (
-            len((*SEARCH_AT, SETTLED_AT)) * SEARCH_SHARE * search.seconds
-            if stage is Stage.MATERIAL_INIT
-            else 0.0
-        )
+        compared = len(COMPARISONS) if stage is Stage.MATERIAL_INIT else 0
+        searches = compared * SEARCH_SHARE * search.seconds
         cost = _cost_of_steps(setup, steps, times, searches)
         if stage in with_material:
             cost = replace(cost, start=surface + places)

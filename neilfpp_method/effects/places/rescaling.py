@@ -1,13 +1,14 @@
 """Correct the scale between light and base colour under the light of a half-trained model.
 
 The scale of the initial light (`effects.light_scale`) is off by up to a quarter, because its coarse map blurs
-the highlights that reveal it. The map of a half-trained model is sharper. So the light is divided by several
-factors, the best material of each place is found under each of these lights, and held-back views select the
-factor.
+the highlights that reveal it, and in a scene with lamps by more, because it has none. The light of a
+half-trained model is sharper and has lamps. So it is divided by several factors, the best material of each
+place is found under each of these lights, and held-back views select the factor.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,10 +19,12 @@ from neilfpp_method.lighting.objective import DARK_FLOOR
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 
-__all__ = ["FACTORS", "Rescaled", "correct_scale"]
+__all__ = ["BRIGHTER", "FACTORS", "Rescaled", "correct_scale"]
 
 FACTORS = (0.59, 0.7, 0.84, 1.0, 1.19, 1.41, 1.68)
 """Factors on base colour that are tried, in equal steps of the logarithm. Initial scales are off by less."""
+BRIGHTER = tuple(factor for factor in FACTORS if factor >= 1)
+"""Those of them that make the light weaker, and 1."""
 FOLDS = 5
 """Number of folds of the views. Each of them is held back once."""
 
@@ -47,7 +50,9 @@ class Rescaled:
 
 
 @torch.no_grad()
-def correct_scale(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> Rescaled | None:
+def correct_scale(
+    model: NeilfModel, solver: LightSolver, lit: LitPlaces, factors: Sequence[float] = FACTORS
+) -> Rescaled | None:
     """Make base colours brighter and the light weaker by the factor that explains held-back views best.
 
     Args:
@@ -55,6 +60,7 @@ def correct_scale(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> Res
             base colour is a weak prior, as in the search for the initial light.
         solver: keeps the scale in later fits of the light.
         lit: places under the light of the model.
+        factors: factors on base colour that are tried.
 
     Returns:
         The places under the changed light; None if the scale is known (`LightSolver.scale_is_free`), or if so
@@ -65,10 +71,10 @@ def correct_scale(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> Res
         return None
     mean = current.base_color.clamp_min(DARK_FLOOR).log().mean().exp().item()
     permitted = PAINT_OR_METAL if model.brdf.metals else PAINT
-    errors = dict.fromkeys((mean * factor for factor in FACTORS), 0.0)
+    errors = dict.fromkeys((mean * factor for factor in factors), 0.0)
     for number in range(FOLDS):
         split = lit.hold_back(number, FOLDS)
-        for factor in FACTORS:
+        for factor in factors:
             material = split.known.dimmed(factor).best(permitted).material
             error = split.held_back.dimmed(factor).error(material)
             errors[mean * factor] += error.abs().clamp_max(1).mean().item() / FOLDS

@@ -16,7 +16,7 @@ from torch import nn
 from neilfpp_method.effects.first_light import seconds_of_pixel
 from neilfpp_method.effects.following import Followers, follow, follow_fit, improve, start_light
 from neilfpp_method.effects.places.gathering import MIN_COSINE, SAME_NORMAL, Places
-from neilfpp_method.effects.places.search import is_comparison_due, is_search_due
+from neilfpp_method.effects.places.search import comparison_due
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.review import SURFACE_PIXELS, review_light_at, review_visibility
 from neilfpp_method.lighting.fit import Evidence
@@ -89,9 +89,10 @@ class PlaceSolver(nn.Module):
             if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
                 self._tried = True
                 self._start_light(followers, step)
-            if is_comparison_due(model, position) and position.step != self._searched:
+            comparison = comparison_due(model, position)
+            if comparison is not None and position.step != self._searched:
                 self._searched = position.step
-                improve(followers, self.places(), is_search_due(position), step)
+                improve(followers, self.places(), comparison, step)
 
     def after_fit(
         self, model: NeilfModel, light_solver: LightSolver, evidence: Evidence | None, step: int

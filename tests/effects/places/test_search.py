@@ -1,4 +1,4 @@
-"""The search for paint at which training is stuck, and the training of the BRDF field on what it finds."""
+"""The search for paint that was taken for metal, and the training of the BRDF field on what it finds."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import torch
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.places.search import (
-    SEARCH_AT,
-    SETTLED_AT,
+    COMPARISONS,
+    Comparison,
     SearchedMaterial,
-    is_comparison_due,
-    is_search_due,
+    comparison_due,
     search_materials,
     teach,
 )
@@ -86,42 +85,10 @@ def test_the_right_material_is_kept(places: Places):
     assert kept > 0.8
 
 
-@pytest.mark.parametrize("metals", [True, False])
-def test_shiny_paint_that_was_learned_as_matte_paint_becomes_shiny(metals: bool):
-    one = torch.ones(COUNT, 1)
-    shiny = ball(0.3 * one.expand(-1, 3), 0.28 * one, 0 * one, LOBE, VIEWS, fine_sky())
-    model = trained_to(matte(0.3, 0.0), shiny)
-    model.brdf.metals = metals
-    searched = search(model, shiny)
-    assert searched.share > 0.8
-    teach(model.brdf, searched)
-    with torch.no_grad():
-        learned = model.brdf(shiny.observed.position)
-    assert learned.roughness.median() == pytest.approx(0.28, abs=0.03)
-    assert learned.metallic.median() < 0.1
-
-
-def test_paint_of_about_the_right_roughness_is_kept():
-    """The field is more exact than the grid."""
-    one = torch.ones(COUNT, 1)
-    shiny = ball(0.3 * one.expand(-1, 3), 0.28 * one, 0 * one, LOBE, VIEWS, fine_sky())
-    assert search(trained_to(matte(0.3, 0.0, 0.33), shiny), shiny).share < 0.1
-
-
-def test_a_single_roughness_is_kept():
-    one = torch.ones(COUNT, 1)
-    shiny = ball(0.3 * one.expand(-1, 3), 0.28 * one, 0 * one, LOBE, VIEWS, fine_sky())
-    model = trained_to(matte(0.3, 0.0), shiny)
-    model.brdf.varying_roughness = False
-    assert search(model, shiny).share < 0.1
-
-
 def test_paint_does_not_become_metal():
     one = torch.ones(COUNT, 1)
     metal = ball(0.6 * one.expand(-1, 3), 0.3 * one, one, LOBE, VIEWS, fine_sky())
-    searched = search(trained_to(PAINT, metal), metal)
-    assert searched.share < 0.05
-    assert searched.material.metallic.max() < 0.1
+    assert search(trained_to(PAINT, metal), metal).share == 0
 
 
 def matte(base_color: float, metallic: float, roughness: float = 0.9) -> Material:
@@ -143,29 +110,36 @@ def test_rough_metal_is_kept():
     assert search(trained_to(matte(0.52, 0.9, 0.8), iron), iron).share < 0.2
 
 
-def due_after(model: NeilfModel, length: int) -> list[int]:
-    """The numbers of steps of material init after which a search is due."""
+def due_after(model: NeilfModel, length: int) -> dict[int, Comparison]:
+    """What is compared after which numbers of steps of material init."""
     positions = [StagePosition(Stage.MATERIAL_INIT, n, length) for n in range(1, length + 1)]
-    return [position.step for position in positions if is_comparison_due(model, position)]
+    due = {position.step: comparison_due(model, position) for position in positions}
+    return {step: comparison for step, comparison in due.items() if comparison is not None}
 
 
 def test_a_comparison_is_due_once_at_each_of_its_times():
     model = sphere_model(preset("fast"))
-    for length in (3, 7, 1500):
-        assert due_after(model, length) == [math.ceil(share * length) for share in (*SEARCH_AT, SETTLED_AT)]
-    assert not any(is_comparison_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
+    for length in (10, 17, 1500):
+        expected = {math.ceil(share * length): comparison for share, comparison in COMPARISONS.items()}
+        assert due_after(model, length) == expected
+    assert not any(comparison_due(model, StagePosition(Stage.JOINT, n, 30)) for n in range(31))
 
 
-def test_the_last_comparison_is_of_the_scale_only():
-    positions = [StagePosition(Stage.MATERIAL_INIT, n, 1500) for n in range(1, 1501)]
-    assert [position.step for position in positions if is_search_due(position)] == [500, 1000]
+def test_the_first_comparison_is_of_weaker_light_and_the_last_of_the_scale():
+    due = due_after(sphere_model(preset("fast")), 1500)
+    assert due == {
+        150: Comparison.WEAKER_LIGHT,
+        500: Comparison.MATERIAL,
+        1000: Comparison.MATERIAL,
+        1350: Comparison.SCALE,
+    }
 
 
 def test_nothing_is_compared_under_a_free_light_or_without_highlights():
     matte = sphere_model(preset("fast"))
     matte.lobe = None
     for model in (matte, sphere_model(preset("paper-ngp"))):
-        assert due_after(model, 30) == []
+        assert due_after(model, 30) == {}
 
 
 def test_gradients_that_the_field_has_are_kept():
