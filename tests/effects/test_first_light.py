@@ -74,8 +74,9 @@ def alternatives_of(places: Places, response: str = "linear") -> Alternatives:
 
 
 def test_held_back_views_identify_the_lobe_of_the_images():
-    torch.manual_seed(1)
-    color, ones = 0.2 + 0.6 * torch.rand(60, 3), torch.ones(60, 1)
+    # With half as many places the result depended on rounding, so on the processor.
+    torch.manual_seed(0)
+    color, ones = 0.2 + 0.6 * torch.rand(120, 3), torch.ones(120, 1)
 
     def gain(lobe: str) -> Measurement:
         places = ball(color, 0.36 * ones, ones, LOBES[lobe], views=16)
