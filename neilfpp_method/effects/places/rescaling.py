@@ -1,7 +1,7 @@
 """Correct the scale between light and base colour under the light of a half-trained model.
 
 The scale of the initial light (`effects.light_scale`) is off by up to a quarter, because its coarse map blurs
-the highlights that reveal it, and in a scene with lamps by more, because it has none. The light of a
+the highlights that reveal it, and by more in a scene with lamps, which that light lacks. The light of a
 half-trained model is sharper and has lamps. So it is divided by several factors, the best material of each
 place is found under each of these lights, and held-back views select the factor.
 """
