@@ -89,6 +89,8 @@ class PlaceSolver(nn.Module):
             if self.is_waiting(light_solver) and (self.points.full or self._steps >= MAX_WAIT):
                 self._tried = True
                 self._start_light(followers, step)
+            if self.is_waiting(light_solver):
+                return  # there is no light yet under which anything could be compared
             comparison = comparison_due(model, position)
             if comparison is not None and position.step != self._searched:
                 self._searched = position.step

@@ -62,6 +62,18 @@ def test_an_empty_solver_has_no_places():
     assert solver.places().count == 0
 
 
+def test_nothing_is_compared_before_the_light_has_started(monkeypatch):
+    compared = []
+    monkeypatch.setattr(place_solver, "improve", lambda *arguments: compared.append(arguments))
+    solver = PlaceSolver(as_set(), "linear", print)
+    model = sphere_model(solved_light(tiny_config()))
+    light_solver, length = model.light_solver(), place_solver.MAX_WAIT // 2
+    for step in range(length):
+        assert solver.is_waiting(light_solver)
+        solver.before_step(model, light_solver, StagePosition(Stage.MATERIAL_INIT, step, length), step)
+    assert not compared
+
+
 def test_clipped_pixels_are_left_out_and_display_values_become_linear():
     observed = ball(*[0.5 * torch.ones(10, n) for n in (3, 1, 1)], None, VIEWS).observed
     solver = PlaceSolver(as_set(), "srgb", print)
