@@ -65,8 +65,8 @@ class AttachedNeilf(nn.Module):
         proxy: traces rays between surfaces if the host cannot do it cheaply; `proxy.report()` measures its
             error. None if the host traces these rays itself, or if the settings trace no rays.
         light_solver: stores surface points of the training steps and solves for the light at intervals.
-        places: stores more of them, decides on effects, finds an initial light, and searches for paint that
-            was taken for metal.
+        places: stores more of them, decides on effects, finds an initial light, and searches for paint at
+            which training is stuck.
         plan: the effects that are simulated, and why (docs/effects.md); `effects.table.effects_table` draws
             it.
         missing: the optional methods that the host does not have, and the consequence of each.

@@ -6,5 +6,6 @@ moments of training when they are cheap; the folder `evidence` has one module fo
 the decisions on to the model, its light and the console. `table` formats a plan.
 
 Several measurements fit light and materials to places, which are in the folder `places`. The same fits give
-the initial light (`first_light`) and find paint that was taken for metal (`places.search`).
+the initial light (`first_light`, with lamps `first_lamps`), with which `start` begins the training, and find
+paint at which training is stuck (`places.search`).
 """

@@ -135,9 +135,7 @@ EFFECTS: Mapping[str, Effect] = {
             on=lambda config: {"light.kind": "distant_near"},
             off=lambda config: {"light.kind": "distant"},
             obstacle=_free_light("a light that is free at every point includes that of lamps"),
-            cost=lambda config: (
-                f"a second fit of the light every {_every(config)} steps, and a shadow ray per point and lamp"
-            ),
+            cost=lambda config: "a search for their places, and a shadow ray per point and lamp",
             risk="the light of near lamps is baked into the base colour",
             solved=True,
         ),
@@ -311,7 +309,3 @@ EFFECTS: Mapping[str, Effect] = {
     )
 }
 """All effects by name, in the order of the table."""
-
-
-def _every(config: NeilfConfig) -> int:
-    return config.light.fit.every if isinstance(config.light, MapLightConfig) else 0

@@ -15,8 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from neilfpp_method.effects.evidence.lamps import LampTrial
 from neilfpp_method.effects.light_scale import FIRST_SCALE, SCALES, lowest_scale, scale_of_metals, with_prior
@@ -31,22 +29,14 @@ from neilfpp_method.effects.places.fit import (
     place_errors,
     seconds_of_step,
 )
-from neilfpp_method.lighting.fit import Evidence
-from neilfpp_method.lighting.solver import LightSolver
-from neilfpp_method.model import NeilfModel
-from neilfpp_method.structures import Material, Observed
+from neilfpp_method.structures import Material
 
-__all__ = ["MIN_PLACES", "FirstLight", "find_first_light", "seconds_of_pixel", "start_with"]
+__all__ = ["CARRIED_ROUNDS", "MIN_PLACES", "FirstLight", "find_first_light", "seconds_of_pixel"]
 
 MIN_PLACES = 100
 """Minimum number of places for an initial light."""
 FOLDS = 5
 """One in this many views is held back."""
-LAMP_PIXELS = 4096
-"""Number of pixels for the search for lamps. With 1024, the gain by lamps on recovered geometry varied from
-−0.4 % to 2.9 % between random selections in a scene with lamps (standard error 0.5 %); with 4096 from
-1.3 % to 2.3 %.
-"""
 CARRIED_ROUNDS = 2
 """Alternations of light and material in a fit that starts from the fit of another scale or of fewer views."""
 ALTERNATIVE_FITS = 1.8
@@ -67,31 +57,37 @@ class FirstLight:
     """An initial light and material.
 
     Attributes:
-        log_radiance: logarithm of the radiance of the map.
-        mean: mean material of the places, N = 1; for base colour the geometric mean.
-        errors: relative error in the held-back views for each mean base colour that was tried.
+        fit: the map, and the materials of the places.
         scale: the chosen mean base colour (`light_scale`).
-        places: number of places.
-        observed: at most `LAMP_PIXELS` pixels of the places, for the search for lamps.
-        material: material of these pixels, with the same base colour everywhere. In the fit the base colour
-            of each place is free, so that it contains the light of lamps.
+        errors: relative error in the held-back views for each mean base colour that was tried.
+        data: the places.
+        metals: whether metallic may be greater than 0.
         lamp_trial: measures whether lamps explain held-back views better.
     """
 
-    log_radiance: Float[Tensor, "3 H W"]
-    mean: Material
-    errors: Mapping[float, float]
+    fit: PlaceFit
     scale: float
-    places: int
-    observed: Observed
-    material: Material
+    errors: Mapping[float, float]
+    data: PlaceData
+    metals: bool
     lamp_trial: LampTrial
+
+    @property
+    def mean(self) -> Material:
+        """Mean material of the places, N = 1; for base colour the geometric mean."""
+        materials = self.fit.material(self.data.places.place.unique())
+        return Material(
+            materials.base_color.log().mean(0, keepdim=True).exp(),
+            materials.roughness.mean(0, keepdim=True),
+            materials.metallic.mean(0, keepdim=True),
+        )
 
     def summary(self) -> str:
         """One line for the console."""
         bounded = SCALES[0] < self.scale < SCALES[-1]
         caution = "" if bounded else " (at the end of the range that was tried)"
-        return f"initial light: fitted at {self.places} places; mean base colour {self.scale:.2f}{caution}"
+        count = self.data.places.shown_count
+        return f"initial light: fitted at {count} places; mean base colour {self.scale:.2f}{caution}"
 
 
 @torch.no_grad()
@@ -105,43 +101,24 @@ def find_first_light(data: PlaceData, metals: bool) -> FirstLight | None:
     Returns:
         The initial light; None if there are fewer than `MIN_PLACES` places.
     """
-    places = data.places
-    if places.shown_count < MIN_PLACES:
+    if data.places.shown_count < MIN_PLACES:
         return None
     split = data.hold_back(0, FOLDS)
     fits = {FIRST_SCALE: fit_places(split.known, Permitted(metals, FIRST_SCALE))}
     for scale in (*(s for s in SCALES if s > FIRST_SCALE), *(s for s in reversed(SCALES) if s < FIRST_SCALE)):
-        start = _rescaled(fits, scale)
+        start = _nearest(fits, scale)
         fits[scale] = fit_places(split.known, Permitted(metals, scale), start, CARRIED_ROUNDS)
     errors = {scale: place_errors(fit, split.held_back) for scale, fit in fits.items()}
     mean_errors = {scale: error.mean().item() for scale, error in errors.items()}
     scale = scale_of_metals(fits, errors, split.held_back.places)
     if scale is None:
         scale = lowest_scale(with_prior(mean_errors, data.response))
-    start = _rescaled(fits, scale)
+    start = _nearest(fits, scale)
 
     def fit_on(changed: PlaceData) -> PlaceFit:
         return fit_places(changed, Permitted(metals, scale), start, CARRIED_ROUNDS)
 
-    best = fit_on(data)
-    materials = best.material(places.place.unique())
-    mean = Material(
-        materials.base_color.log().mean(0, keepdim=True).exp(),
-        materials.roughness.mean(0, keepdim=True),
-        materials.metallic.mean(0, keepdim=True),
-    )
-    drawn = torch.randperm(len(places.place), device=places.place.device)[:LAMP_PIXELS]
-    material = best.material(places.place[drawn])
-    return FirstLight(
-        log_radiance=best.log_radiance,
-        mean=mean,
-        errors=mean_errors,
-        scale=scale,
-        places=places.shown_count,
-        observed=places.observed[drawn],
-        material=Material(mean.base_color.expand(len(drawn), 3), material.roughness, material.metallic),
-        lamp_trial=LampTrial(split, fit_on),
-    )
+    return FirstLight(fit_on(data), scale, mean_errors, data, metals, LampTrial(split, fit_on))
 
 
 def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -> float:
@@ -163,26 +140,7 @@ def seconds_of_pixel(device: torch.device, with_lobe: bool, with_metals: bool) -
     return (1 + OVERHEAD_SHARE) * steps * seconds_of_step(TIMED_PIXELS, device) / TIMED_PIXELS
 
 
-@torch.no_grad()
-def start_with(model: NeilfModel, solver: LightSolver, first: FirstLight) -> Evidence | None:
-    """Set the light of a model and the initial material of its untrained BRDF field, and look for lamps.
-
-    Returns:
-        The evidence for lamps, as `LightSolver.start` returns it.
-    """
-    log_radiance = first.log_radiance
-    model.light.resample(
-        log_radiance.mean(0, keepdim=True).expand_as(log_radiance)
-        if model.config.light.monochrome
-        else log_radiance
-    )
-    model.brdf.start_at(first.mean)
-    return solver.start(first.observed, first.material, model.scene, first.lamp_trial)
-
-
-def _rescaled(fits: Mapping[float, PlaceFit], scale: float) -> PlaceFit:
-    """The fit of the nearest scale, with base colours (at most 1) and light scaled inversely."""
+def _nearest(fits: Mapping[float, PlaceFit], scale: float) -> PlaceFit:
+    """The fit of the nearest scale, brightened to this scale."""
     nearest = min(fits, key=lambda tried: abs(math.log(tried / scale)))
-    fit, factor = fits[nearest], scale / nearest
-    base_color = (fit.base_color * factor).clamp_max(1.0)
-    return PlaceFit(fit.log_radiance - math.log(factor), base_color, fit.roughness, fit.metallic)
+    return fits[nearest].brightened(scale / nearest)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from neilfpp_method.effects.first_light import start_with
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.search import Comparison
 from neilfpp_method.effects.plan import Decision, Plan
@@ -16,6 +15,7 @@ from neilfpp_method.effects.review import (
     review_diffuse,
     review_metals,
 )
+from neilfpp_method.effects.start import start_with
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel

@@ -24,7 +24,7 @@ from neilfpp_method.effects.first_light import MIN_PLACES, FirstLight, find_firs
 from neilfpp_method.effects.measurement import Measurement
 from neilfpp_method.effects.places.gathering import Places, gather_places
 from neilfpp_method.effects.places.lit import LitPlaces, light_up
-from neilfpp_method.effects.places.rescaling import BRIGHTER, FACTORS, correct_scale
+from neilfpp_method.effects.places.rescaling import correct_scale
 from neilfpp_method.effects.places.search import Comparison, search_materials, teach
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.lighting.fit import MIN_GAIN, Evidence
@@ -198,7 +198,7 @@ class Improved:
 def improve_material(
     model: NeilfModel, solver: LightSolver, places: Places, comparison: Comparison
 ) -> Improved | None:
-    """Correct the scale of a half-trained model, and replace metal by paint where paint is better.
+    """Correct the scale of a half-trained model, and its material where training is stuck (`places.search`).
 
     Args:
         model: its light is an environment map; see `places.search.comparison_due`.
@@ -212,17 +212,15 @@ def improve_material(
     if places.shown_count < MIN_PLACES:
         return None
     lit, summaries = light_up(model, places), []
-    factors = BRIGHTER if comparison is Comparison.WEAKER_LIGHT else FACTORS
-    rescaled = correct_scale(model, solver, lit, factors)
+    rescaled = correct_scale(model, solver, lit)
     if rescaled is not None:
         lit = rescaled.lit
         summaries.append(rescaled.summary())
-    if comparison is Comparison.MATERIAL and model.brdf.metals:
+    if comparison is Comparison.MATERIAL and (model.brdf.metals or model.brdf.varying_roughness):
         searched = search_materials(model.brdf, lit)
         if searched.share > 0:
             teach(model.brdf, searched)
-        paint = f"{searched.share:.0%} of the places are paint that was taken for metal"
-        summaries.append(f"material search: {paint}")
+        summaries.append(f"material search: training is stuck at {searched.share:.0%} of the places")
     return Improved(lit, summaries)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from neilfpp_method.lighting.objective import EVENNESS, Objective, Target, nearest_points, unevenness
@@ -55,7 +55,7 @@ def descend(
 ) -> Descended:
     """Minimise a loss over the unknowns and over factors ("gains") on the base colour of the points.
 
-    Every point has a gain per channel; if the base colours are known, all points share it. The mean
+    Every place has a gain per channel; if the base colours are known, all places share it. The mean
     logarithm of the gains is `objective.log_scale`, because the pixels of the points hardly determine
     the common scale of light and base colour.
 
@@ -69,19 +69,27 @@ def descend(
     """
     scale = objective.log_scale
     known, base_color = objective.base_color_known, target.material.base_color
-    log_gain = torch.zeros_like(base_color[:1] if known else base_color, requires_grad=True)
-    nearest = None if known else nearest_points(target.position)
+    place = torch.arange(len(base_color), device=base_color.device) if target.place is None else target.place
+    point = _one_point_each(place)
+    log_gain = torch.zeros_like(base_color[:1] if known else base_color[point], requires_grad=True)
+    nearest = None if known else nearest_points(target.position[point])
     groups = [{"params": [u.value], "lr": u.rate} for u in (*unknowns, Unknown(log_gain, gain_rate))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, FINAL_RATE_SHARE ** (1 / steps))
     with torch.enable_grad():
         for _ in range(steps):
             gain = (log_gain if scale is None else log_gain - log_gain.mean() + scale).exp()
-            loss = loss_of(gain)
+            loss = loss_of(gain if known else gain[place])
             if nearest is not None:
-                loss = loss + EVENNESS * unevenness(base_color * gain, nearest)
+                loss = loss + EVENNESS * unevenness(base_color[point] * gain, nearest)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
             schedule.step()
     return Descended(loss.item(), log_gain.mean().item() if scale is None else scale)
+
+
+def _one_point_each(place: Int[Tensor, " N"]) -> Int[Tensor, " P"]:
+    """Index of one of the points of each place."""
+    count = int(place.max()) + 1 if len(place) else 0
+    return place.new_zeros(count).scatter(0, place, torch.arange(len(place), device=place.device))

@@ -22,6 +22,7 @@ from neilfpp_method.lighting.objective import Objective, Target, white_balance
 from neilfpp_method.lighting.transport import Transport
 
 __all__ = [
+    "MIN_REACH",
     "CarriedLight",
     "Evidence",
     "MapAndLamps",

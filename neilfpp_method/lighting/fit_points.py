@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from neilfpp_method.fields.environment import EnvironmentLight
@@ -29,17 +29,20 @@ class FitPoints:
         lobe: the specular lobe; None for Lambertian surfaces.
         scene: traces rays from the points through the scene, which blocks light and emits its own radiance;
             None if inter-reflection is off.
+        place: number of the place that each point shows; None if every point is a place of its own (see
+            `Target`).
     """
 
     observed: Observed
     material: Material
     lobe: Lobe | None
     scene: SceneTracer | None
+    place: Int[Tensor, " N"] | None = None
 
     @property
     def target(self) -> Target:
         """What a fit has to explain at these points."""
-        return Target(self.observed.position, self.material, self.observed.pixel)
+        return Target(self.observed.position, self.material, self.observed.pixel, self.place)
 
     def from_texels(self, environment: EnvironmentLight) -> Transport:
         """See `map_transport.from_texels`."""

@@ -86,14 +86,18 @@ class Target(Indexable):
         position: of the points, scene frame.
         material: of the points; it is not differentiated.
         pixel: their pixels, in the response of the capture.
+        place: number of the place that each point shows, from 0 on. All points of a place have the same
+            position and base colour. None if every point is a place of its own.
     """
 
     position: Float[Tensor, "N 3"]
     material: Material
     pixel: Float[Tensor, "N 3"]
+    place: Int[Tensor, " N"] | None = None
 
     def __getitem__(self, rows: Tensor | slice) -> Target:
-        return Target(self.position[rows], self.material[rows], self.pixel[rows])
+        place = None if self.place is None else self.place[rows].unique(return_inverse=True)[1]
+        return Target(self.position[rows], self.material[rows], self.pixel[rows], place)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from torch import Tensor
 from neilfpp_method.fields.lamps import LampPlaces
 from neilfpp_method.lighting.candidates import FoundLamps
 from neilfpp_method.lighting.descent import Unknown, descend
+from neilfpp_method.lighting.fit import MIN_REACH
 from neilfpp_method.lighting.fit_points import FitPoints
 from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.transport import Transport
@@ -65,7 +66,7 @@ def settle_lamps(
     First all lamps are refined together. Then each lamp, from the weakest to the strongest, is dropped if
     the loss is lower without it, after its power is given to the nearest other lamp and the rest is refined
     again. Finally each remaining lamp is tried as a panel and as a bulb, because a panel at one place looks
-    much like a bulb at another.
+    much like a bulb at another. A lamp that hardly reaches any point is dropped: nothing determines it.
 
     Args:
         initial: initial lamps, the strongest first.
@@ -77,7 +78,7 @@ def settle_lamps(
     Returns:
         The refined lamps; `initial` if there are no points or the descent is not finite.
     """
-    if not len(initial.intensity) or not len(points.observed):
+    if not len(points.observed):
         return initial
     target, position = points.target, points.observed.position
 
@@ -95,6 +96,15 @@ def settle_lamps(
         sight = points.in_sight(lamps.places, radius)
         return _descend(lamps, target, objective, lambda moved, gain: loss_of(moved, sight, gain))
 
+    def reaching(lamps: FoundLamps) -> FoundLamps:
+        kernel = points.lamp_kernel(lamps.places, radius, points.in_sight(lamps.places, radius))
+        reach = kernel[0].mean(0)
+        keep = reach > MIN_REACH * reach.mean()
+        return FoundLamps(lamps.places[keep], lamps.intensity[keep])
+
+    initial = reaching(initial)
+    if not len(initial.intensity):
+        return initial
     best = settle(initial)
     if not math.isfinite(best.loss):
         return initial
@@ -109,7 +119,7 @@ def settle_lamps(
         is_panel = best.lamps.places.axis[number].any()
         panel, bulb = (best, other) if is_panel else (other, best)
         best = panel if panel.loss < (1 - PANEL_GAIN) * bulb.loss else bulb
-    return settle(best.lamps).lamps
+    return reaching(settle(best.lamps).lamps)
 
 
 def _of_other_kind(lamps: FoundLamps, number: int, points: Float[Tensor, "N 3"]) -> FoundLamps:

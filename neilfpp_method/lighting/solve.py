@@ -18,7 +18,7 @@ from neilfpp_method.lighting.objective import Objective, Target
 from neilfpp_method.lighting.settle import settle_lamps
 from neilfpp_method.settings.types import MapLightConfig
 
-__all__ = ["solve_light"]
+__all__ = ["refit_light", "solve_light"]
 
 CANDIDATES = 256
 """Number of candidate lamps in one fit."""
@@ -93,6 +93,19 @@ def solve_light(
     return measured
 
 
+@torch.no_grad()
+def refit_light(light: LightModel, points: FitPoints, objective: Objective, config: MapLightConfig) -> None:
+    """Fit the map and the intensities of the lamps, whose places are kept. A known map is left unchanged."""
+    map_only = _map_only(light.light, points, is_known=config.map is not None)
+    _fit_with(
+        light.lamps,
+        FoundLamps(light.lamps.lit_places, light.lamps.lit_intensity),
+        map_only,
+        points,
+        objective,
+    )
+
+
 def _settle(
     lamps: Lamps, merged: FoundLamps, map_only: CarriedLight, points: FitPoints, objective: Objective
 ) -> None:
@@ -100,13 +113,20 @@ def _settle(
 
     The map was fitted together with the candidates, so it must be fitted again with the lamps in their place.
     """
-    unknown = map_only.light.log_radiance
-    map_light = map_only.transport.with_strength(unknown.exp().flatten(1).t())
+    map_light = map_only.transport.with_strength(map_only.light.log_radiance.exp().flatten(1).t())
     settled = settle_lamps(merged, lamps.radius, map_light, points, objective)
-    transport = map_only.transport.concatenate(points.from_lamps(settled.places, lamps.radius))
-    fitted = CarriedLight(MapAndLamps(unknown, settled.intensity), transport).fit(points.target, objective)
+    _fit_with(lamps, settled, map_only, points, objective)
+
+
+def _fit_with(
+    lamps: Lamps, start: FoundLamps, map_only: CarriedLight, points: FitPoints, objective: Objective
+) -> None:
+    """Fit the map and the intensities of lamps at these places, and set both."""
+    unknown, places = map_only.light.log_radiance, start.places
+    transport = map_only.transport.concatenate(points.from_lamps(places, lamps.radius))
+    fitted = CarriedLight(MapAndLamps(unknown, start.intensity), transport).fit(points.target, objective)
     unknown.copy_(fitted.log_radiance)
-    lamps.place(settled.places.position, fitted.intensity, settled.places.axis)
+    lamps.place(places.position.clone(), fitted.intensity, places.axis.clone())
 
 
 def _map_only(environment: EnvironmentLight, points: FitPoints, is_known: bool) -> CarriedLight:

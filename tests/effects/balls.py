@@ -10,7 +10,9 @@ from torch import Tensor
 from neilfpp_method.effects.evidence.lamps import LampTrial
 from neilfpp_method.effects.first_light import FirstLight
 from neilfpp_method.effects.places.data import ROWS, PlaceData, place_transport
+from neilfpp_method.effects.places.fit import PlaceFit
 from neilfpp_method.effects.places.gathering import Places
+from neilfpp_method.effects.places.grid import ROUGHNESSES
 from neilfpp_method.fields.environment import EnvironmentLight
 from neilfpp_method.lighting.map_transport import from_texels
 from neilfpp_method.shading import LOBES
@@ -59,14 +61,14 @@ def data_of(places: Places, lobe: Lobe, response: str = "linear") -> PlaceData:
     return PlaceData(places, place_transport(places, lobe, None), typical, response)
 
 
-def first_light_of_sky() -> FirstLight:
-    """An initial light that is `sky`, with grey surfaces and no pixels for a search for lamps."""
-    none = torch.zeros(0, 3)
-    gray = Material(torch.full((1, 3), 0.5), torch.full((1, 1), 0.5), torch.zeros(1, 1))
-    unseen = Observed(none, none, none, none), Material(none, none[:, :1], none[:, :1])
-    places = ball(torch.ones(1, 3), torch.ones(1, 1), torch.zeros(1, 1), None)
-    trial = LampTrial(data_of(places, LOBES["ggx"]).hold_back(0, 2), pytest.fail)
-    return FirstLight(sky().log_radiance, gray, {0.33: 0.1}, 0.33, 1, *unseen, trial)
+def first_light_of_sky(response: str = "linear") -> FirstLight:
+    """An initial light that is `sky`, with one grey place."""
+    one = torch.ones(1, 1)
+    data = data_of(ball(one.expand(1, 3), one, 0 * one, LOBES["ggx"]), LOBES["ggx"], response)
+    index = torch.tensor([ROUGHNESSES.index(0.45)])
+    fit = PlaceFit(sky().log_radiance, 0.5 * one.expand(1, 3), index, 0 * index)
+    trial = LampTrial(data.hold_back(0, 2), pytest.fail)
+    return FirstLight(fit, 0.33, {0.33: 0.1}, data, metals=True, lamp_trial=trial)
 
 
 def _rendered(

@@ -153,6 +153,22 @@ def test_base_colours_learned_under_a_misplaced_lamp_do_not_keep_it_there(base_c
     assert not base_color_known or off > 0.15
 
 
+def test_a_lamp_that_no_point_sees_is_dropped():
+    """Its intensity is not given to another lamp, which would become far too bright."""
+    true = FoundLamps(TRUE.places[:1], TRUE.intensity[:1])
+    hidden = torch.tensor([[0.3, 0.2, -2.8]])
+    start = FoundLamps(
+        LampPlaces(torch.cat((true.places.position, hidden)), torch.zeros(2, 3)),
+        torch.cat((true.intensity, 20 * true.intensity)),
+    )
+    seen, of, beside = photographed(true, speckled=True)
+    objective = Objective("linear", seen.pixel.median().item(), STEPS, base_color_known=True)
+    found = settle_lamps(start, RADIUS, beside, FitPoints(seen, of, GGX, half_room), objective)
+    assert len(found.intensity) == 1
+    torch.testing.assert_close(found.places.position, true.places.position, rtol=0, atol=0.01)
+    torch.testing.assert_close(found.intensity, true.intensity, rtol=0.05, atol=0)
+
+
 @pytest.mark.parametrize("broken", ["no points", "no lamps", "a pixel that is no number"])
 def test_without_information_lamps_are_unchanged(broken):
     seen, of, beside = photographed(TRUE, speckled=True)

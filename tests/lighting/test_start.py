@@ -12,6 +12,7 @@ from neilfpp_method.lighting import solver as solver_module
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.objective import Objective
 from neilfpp_method.settings.presets import preset
+from neilfpp_method.settings.types import MapLightConfig
 from neilfpp_method.structures import Material, Observed
 from tests.lighting.surfaces import material, points
 from tests.scenes import sphere_model
@@ -21,16 +22,15 @@ HARMFUL = Evidence(-0.1, 0.01, 400)
 
 
 @pytest.mark.parametrize("in_views", [HELPFUL, HARMFUL], ids=["lamps", "no lamps"])
-def test_the_first_fit_is_even_after_lamps_and_keeps_a_map_without_them(in_views, monkeypatch):
-    counts: list[int] = []
+def test_later_fits_start_from_the_initial_light_and_keep_the_places_of_its_lamps(in_views, monkeypatch):
     steps: list[int] = []
-    maps: list[torch.Tensor] = []
+    kinds: list[str] = []
 
-    def one_lamp(light: LightModel, _: object, objective: Objective, *__: object, **___: object) -> Evidence:
-        counts.append(light.lamps.count)
+    def one_lamp(light: LightModel, _: object, objective: Objective, config: MapLightConfig, *__, **___):
         steps.append(objective.steps)
-        maps.append(light.light.log_radiance.clone())
-        light.lamps.place(torch.tensor([[0.0, 0.0, 0.9]]), torch.ones(1, 3))
+        kinds.append(config.kind)
+        if config.kind == "auto":
+            light.lamps.place(torch.tensor([[0.0, 0.0, 0.9]]), torch.ones(1, 3))
         return HELPFUL
 
     monkeypatch.setattr(solver_module, "solve_light", one_lamp)
@@ -47,13 +47,19 @@ def test_the_first_fit_is_even_after_lamps_and_keeps_a_map_without_them(in_views
     measured = solver.start(observed, made_of, None, lambda *_: in_views)
     assert measured is in_views
     assert not solver.seeks_start
+    count, before = model.lamps.count, model.light.log_radiance.clone()
+    assert count == (in_views is HELPFUL)
 
     model.brdf.forward = lambda x: Material(*(value[: len(x)] for value in vars(made_of).values()))
     solver.memory.remember(observed)
     assert solver.due
-    solver.solve(model.brdf, None)
-    assert counts == [0, 0]
-    assert steps == [300, 100], "the fits of the start begin without lamps and take longer"
-    torch.testing.assert_close(maps[1].mean((1, 2)), torch.zeros(3), atol=0.1, rtol=0)
-    is_even = maps[1].std((1, 2)).max() < 1e-5
-    assert is_even == (in_views is HELPFUL)
+    evidence = solver.solve(model.brdf, None)
+    if in_views is HELPFUL:
+        assert evidence is None
+        assert steps == [300], "lamps are not sought again"
+        assert model.lamps.lit_places.position.tolist() == [pytest.approx([0.0, 0.0, 0.9])]
+        assert not torch.equal(model.lamps.lit_intensity, torch.ones(1, 3))
+        assert not torch.equal(model.light.log_radiance, before)
+    else:
+        assert (steps, kinds) == ([300, 100], ["auto", "distant"])
+    assert model.lamps.count == count

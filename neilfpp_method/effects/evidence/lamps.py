@@ -13,14 +13,11 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from neilfpp_method.effects.places.data import PlaceData
+from neilfpp_method.effects.places.data import PlaceData, with_lamps
 from neilfpp_method.effects.places.fit import PlaceFit, mean_errors
 from neilfpp_method.effects.places.gathering import Split
-from neilfpp_method.effects.places.grid import ROUGHNESSES
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.fit import Evidence, evidence
-from neilfpp_method.lighting.lamp_transport import in_sight
-from neilfpp_method.lighting.layered_transport import lamp_layers
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer
 
@@ -49,16 +46,8 @@ class LampTrial:
             scene: traces shadow rays; None if inter-reflection is off.
         """
         known, held_back = (
-            _lit(data, lamps, lobe, scene) for data in (self.split.known, self.split.held_back)
+            with_lamps(data, lamps, lobe, scene) for data in (self.split.known, self.split.held_back)
         )
         without = mean_errors(self.refit(self.split.known), self.split.held_back)
         gain = without - mean_errors(self.refit(known), held_back)
         return replace(evidence(gain[gain.isfinite()]), in_views=True)
-
-
-def _lit(data: PlaceData, lamps: Lamps, lobe: Lobe, scene: SceneTracer | None) -> PlaceData:
-    """The same data with the light of lamps, as light that the scene sends."""
-    observed = data.places.observed
-    sight = in_sight(lamps.lit_places, lamps.radius, observed.position, scene)
-    added = lamp_layers(lamps, sight, observed, ROUGHNESSES, lobe)
-    return replace(data, transport=replace(data.transport, scene=data.transport.scene + added))

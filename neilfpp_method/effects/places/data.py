@@ -5,7 +5,7 @@ Because there are few places, the transport is stored as a matrix for each rough
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,12 +13,14 @@ from torch import Tensor
 from neilfpp_method.effects.places.gathering import Places, Split
 from neilfpp_method.effects.places.grid import ROUGHNESSES
 from neilfpp_method.fields.environment import EnvironmentLight
-from neilfpp_method.lighting.layered_transport import texel_layers
+from neilfpp_method.fields.lamps import Lamps
+from neilfpp_method.lighting.lamp_transport import in_sight
+from neilfpp_method.lighting.layered_transport import lamp_layers, texel_layers
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer
 
-__all__ = ["PlaceData", "place_transport"]
+__all__ = ["PlaceData", "place_transport", "with_lamps"]
 
 ROWS = 16
 """Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
@@ -67,3 +69,19 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
         total.sources.add_(part.sources)
         total.scene.add_(part.scene)
     return Transport(total.sources.div_(DIRECTIONS), total.scene.div_(DIRECTIONS))
+
+
+@torch.no_grad()
+def with_lamps(data: PlaceData, lamps: Lamps, lobe: Lobe, scene: SceneTracer | None) -> PlaceData:
+    """The same data with the light of lamps, which is added to the light that the scene sends.
+
+    Args:
+        data: the places.
+        lamps: the lamps.
+        lobe: the specular lobe of `data`.
+        scene: traces shadow rays; None if inter-reflection is off.
+    """
+    observed = data.places.observed
+    sight = in_sight(lamps.lit_places, lamps.radius, observed.position, scene)
+    added = lamp_layers(lamps, sight, observed, ROUGHNESSES, lobe)
+    return replace(data, transport=replace(data.transport, scene=data.transport.scene + added))

@@ -33,7 +33,15 @@ from neilfpp_method.lighting.objective import OUTLIER_ERROR, total_variation, wh
 from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.structures import Material
 
-__all__ = ["Permitted", "PlaceFit", "fit_places", "mean_errors", "place_errors", "seconds_of_step"]
+__all__ = [
+    "Permitted",
+    "PlaceFit",
+    "at_roughness",
+    "fit_places",
+    "mean_errors",
+    "place_errors",
+    "seconds_of_step",
+]
 
 ROUNDS = 6
 """Number of alternations between light and material."""
@@ -91,6 +99,11 @@ class PlaceFit:
     def material(self, place: Int[Tensor, " N"]) -> Material:
         """Materials of the places with these numbers."""
         return on_grid(self.base_color[place], self.roughness[place], self.metallic[place])
+
+    def brightened(self, factor: float) -> PlaceFit:
+        """Base colours that are brighter by a factor, at most 1, under light that is weaker by it."""
+        base_color = (self.base_color * factor).clamp_max(1.0)
+        return replace(self, log_radiance=self.log_radiance - math.log(factor), base_color=base_color)
 
 
 def _any_map(log_radiance: Float[Tensor, "3 H W"]) -> Float[Tensor, "3 H W"]:
@@ -155,7 +168,7 @@ def _even_start(data: PlaceData, base_color: float) -> PlaceFit:
 def place_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " N"]:
     """Relative error of each pixel, clipped at 1 and averaged over the channels."""
     place = data.places.place
-    outgoing = _at_roughness(data.transport, fit.roughness[place]).outgoing(fit.material(place), fit.radiance)
+    outgoing = at_roughness(data.transport, fit.roughness[place]).outgoing(fit.material(place), fit.radiance)
     return relative_error(outgoing, data.places, data.typical).abs().clamp_max(1).mean(-1)
 
 
@@ -164,7 +177,7 @@ def mean_errors(fit: PlaceFit, data: PlaceData) -> Float[Tensor, " P"]:
     return data.places.mean_if_shown(place_errors(fit, data))
 
 
-def _at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
+def at_roughness(transport: Transport, number: Int[Tensor, " N"]) -> Transport:
     """The diffuse, facing and grazing parts of each pixel at the roughness of its place."""
     count = len(ROUGHNESSES)
     sources = layers_at(transport.sources, number, count).float()
@@ -176,7 +189,7 @@ def _better_light(fit: PlaceFit, data: PlaceData, permitted: Permitted, steps: i
     place = data.places.place
     # The base colour of a place without pixels is arbitrary.
     with_pixels = place.unique()
-    selected = _at_roughness(data.transport, fit.roughness[place])
+    selected = at_roughness(data.transport, fit.roughness[place])
     reaching_any = selected.reaching_any()
     selected = selected.select_sources(reaching_any)
     material = fit.material(place)

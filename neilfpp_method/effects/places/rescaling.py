@@ -1,14 +1,13 @@
 """Correct the scale between light and base colour under the light of a half-trained model.
 
 The scale of the initial light (`effects.light_scale`) is off by up to a quarter, because its coarse map blurs
-the highlights that reveal it, and by more in a scene with lamps, which that light lacks. The light of a
-half-trained model is sharper and has lamps. So it is divided by several factors, the best material of each
-place is found under each of these lights, and held-back views select the factor.
+the highlights that reveal it. The map of a half-trained model is sharper. So the light is divided by several
+factors, the best material of each place is found under each of these lights, and held-back views select the
+factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,12 +18,10 @@ from neilfpp_method.lighting.objective import DARK_FLOOR
 from neilfpp_method.lighting.solver import LightSolver
 from neilfpp_method.model import NeilfModel
 
-__all__ = ["BRIGHTER", "FACTORS", "Rescaled", "correct_scale"]
+__all__ = ["FACTORS", "Rescaled", "correct_scale"]
 
 FACTORS = (0.59, 0.7, 0.84, 1.0, 1.19, 1.41, 1.68)
 """Factors on base colour that are tried, in equal steps of the logarithm. Initial scales are off by less."""
-BRIGHTER = tuple(factor for factor in FACTORS if factor >= 1)
-"""Those of them that make the light weaker, and 1."""
 FOLDS = 5
 """Number of folds of the views. Each of them is held back once."""
 
@@ -50,9 +47,7 @@ class Rescaled:
 
 
 @torch.no_grad()
-def correct_scale(
-    model: NeilfModel, solver: LightSolver, lit: LitPlaces, factors: Sequence[float] = FACTORS
-) -> Rescaled | None:
+def correct_scale(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> Rescaled | None:
     """Make base colours brighter and the light weaker by the factor that explains held-back views best.
 
     Args:
@@ -60,7 +55,6 @@ def correct_scale(
             base colour is a weak prior, as in the search for the initial light.
         solver: keeps the scale in later fits of the light.
         lit: places under the light of the model.
-        factors: factors on base colour that are tried.
 
     Returns:
         The places under the changed light; None if the scale is known (`LightSolver.scale_is_free`), or if so
@@ -71,10 +65,10 @@ def correct_scale(
         return None
     mean = current.base_color.clamp_min(DARK_FLOOR).log().mean().exp().item()
     permitted = PAINT_OR_METAL if model.brdf.metals else PAINT
-    errors = dict.fromkeys((mean * factor for factor in factors), 0.0)
+    errors = dict.fromkeys((mean * factor for factor in FACTORS), 0.0)
     for number in range(FOLDS):
         split = lit.hold_back(number, FOLDS)
-        for factor in factors:
+        for factor in FACTORS:
             material = split.known.dimmed(factor).best(permitted).material
             error = split.held_back.dimmed(factor).error(material)
             errors[mean * factor] += error.abs().clamp_max(1).mean().item() / FOLDS

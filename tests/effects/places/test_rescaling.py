@@ -9,7 +9,7 @@ import torch
 
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.lit import light_up
-from neilfpp_method.effects.places.rescaling import BRIGHTER, correct_scale
+from neilfpp_method.effects.places.rescaling import correct_scale
 from neilfpp_method.lighting.solver import MapSolver
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.structures import Material
@@ -55,19 +55,6 @@ def test_the_true_scale_is_found_and_kept_by_later_fits(places: Places, factor: 
     assert solver.log_mean_base_color.exp() == pytest.approx(BASE_COLOR, rel=0.06)
     changed = light_up(model, places)
     torch.testing.assert_close(rescaled.lit.parts.mean(), changed.parts.mean(), rtol=0.02, atol=0)
-
-
-def test_light_that_is_too_strong_is_found_by_brighter_base_colours_alone(places: Places):
-    model, solver = mis_scaled(0.75, places)
-    rescaled = correct_scale(model, solver, light_up(model, places), BRIGHTER)
-    assert rescaled.factor == pytest.approx(1 / 0.75, rel=0.06)
-
-
-def test_light_that_is_too_weak_is_kept_by_brighter_base_colours_alone(places: Places):
-    model, solver = mis_scaled(1.3, places)
-    before = model.light.log_radiance.clone()
-    assert correct_scale(model, solver, light_up(model, places), BRIGHTER).factor == pytest.approx(1)
-    torch.testing.assert_close(model.light.log_radiance, before)
 
 
 def test_a_known_scale_is_not_changed(places: Places):
