@@ -1,8 +1,8 @@
 """Settle the lamps of an initial light, together with its map, its scale, and the materials of the places.
 
 `LightSolver.start` finds lamps beside a map that was fitted without them. Part of their light is in that map,
-and materials hide their highlights in roughness. Surfaces that learn under such a light confirm it: training
-moves the lamps no more. At places every material is tried, so three steps alternate here:
+and materials hide their highlights in roughness. Surfaces that learn under such a light confirm it, so that
+training would leave the lamps where they are. At places every material is tried. Three steps alternate:
 
 1. map and materials are fitted under the light of the lamps,
 2. held-back views select the scale between light and base colour,

@@ -289,10 +289,11 @@ class MapSolver(nn.Module):
         points, config = FitPoints(observed, material, self.lobe, scene), self.config
         if self.lamps_rejected and config.kind == "auto":
             config = dataclasses.replace(config, kind="distant")
+        measured = None
         if light.lamps.count and self._has_initial_light and not at_start:
             refit_light(light, points, objective, config)
-            return None
-        measured = solve_light(light, points, objective, config, first, lamps_if_undecided=at_start)
+        else:
+            measured = solve_light(light, points, objective, config, first, lamps_if_undecided=at_start)
         if environment.even:
             environment.log_radiance.copy_(environment.log_radiance[:, :1, :1].clone())
         return measured

@@ -60,6 +60,10 @@ def test_later_fits_start_from_the_initial_light_and_keep_the_places_of_its_lamp
         assert model.lamps.lit_places.position.tolist() == [pytest.approx([0.0, 0.0, 0.9])]
         assert not torch.equal(model.lamps.lit_intensity, torch.ones(1, 3))
         assert not torch.equal(model.light.log_radiance, before)
+        model.light.set_even(True)
+        solver.memory.remember(observed)
+        solver.solve(model.brdf, None)
+        assert model.light.log_radiance.std((1, 2)).max() < 1e-5, "an even light is fitted as a whole"
     else:
         assert (steps, kinds) == ([300, 100], ["auto", "distant"])
     assert model.lamps.count == count
