@@ -18,7 +18,7 @@ import torch
 
 from neilfpp_method.effects.first_light import CARRIED_ROUNDS, FirstLight
 from neilfpp_method.effects.light_scale import lowest_scale, with_prior
-from neilfpp_method.effects.places.data import PlaceData, with_lamps
+from neilfpp_method.effects.places.data import PlaceData, lamp_light
 from neilfpp_method.effects.places.fit import Permitted, PlaceFit, at_roughness, fit_places, place_errors
 from neilfpp_method.fields.lamps import Lamps
 from neilfpp_method.lighting.candidates import FoundLamps
@@ -66,30 +66,28 @@ def settle_first_lamps(first: FirstLight, found: Lamps, lobe: Lobe, scene: Scene
     """
     split, lamps, fit, scale = first.lamp_trial.split, copy.deepcopy(found), first.fit, first.scale
 
-    def fit_to(data: PlaceData, lamps: Lamps, start: PlaceFit, scale: float, rounds: int) -> PlaceFit:
-        return fit_places(with_lamps(data, lamps, lobe, scene), Permitted(first.metals, scale), start, rounds)
+    def improved(fit: PlaceFit, data: PlaceData, scale: float, rounds: int) -> PlaceFit:
+        return fit_places(data, Permitted(first.metals, scale), fit, rounds)
 
     for _ in range(ROUNDS):
-        fit = fit_to(split.known, lamps, fit, scale, CARRIED_ROUNDS)
+        known, held_back = (
+            lamp_light(part.places, lamps, lobe, scene) for part in (split.known, split.held_back)
+        )
+        fit = improved(fit, split.known.with_light(known), scale, CARRIED_ROUNDS)
         errors = {}
         for factor in FACTORS:
-            dimmed = _dimmed(lamps, factor)
-            tried = fit_to(split.known, dimmed, fit.brightened(factor), scale * factor, 1)
-            held_back = with_lamps(split.held_back, dimmed, lobe, scene)
-            errors[scale * factor] = place_errors(tried, held_back).mean().item()
+            data = split.known.with_light(known / factor)
+            tried = improved(fit.brightened(factor), data, scale * factor, 1)
+            error = place_errors(tried, split.held_back.with_light(held_back / factor))
+            errors[scale * factor] = error.mean().item()
         better = lowest_scale(with_prior(errors, first.data.response))
-        fit, lamps, scale = fit.brightened(better / scale), _dimmed(lamps, better / scale), better
+        fit = fit.brightened(better / scale)
+        lamps.intensity.div_(better / scale)
+        scale = better
         _settle(lamps, fit, split.known, lobe, scene)
-    fit = fit_to(first.data, lamps, fit, scale, CARRIED_ROUNDS)
-    light = replace(first, fit=fit, scale=scale, errors=errors)
+    lit = first.data.with_light(lamp_light(first.data.places, lamps, lobe, scene))
+    light = replace(first, fit=improved(fit, lit, scale, CARRIED_ROUNDS), scale=scale, errors=errors)
     return FirstLamps(light, FoundLamps(lamps.lit_places, lamps.lit_intensity))
-
-
-def _dimmed(lamps: Lamps, factor: float) -> Lamps:
-    """Lamps that are weaker by this factor."""
-    dimmed = copy.deepcopy(lamps)
-    dimmed.intensity.div_(factor)
-    return dimmed
 
 
 def _settle(lamps: Lamps, fit: PlaceFit, data: PlaceData, lobe: Lobe, scene: SceneTracer | None) -> None:

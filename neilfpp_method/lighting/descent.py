@@ -71,7 +71,8 @@ def descend(
     known, base_color = objective.base_color_known, target.material.base_color
     place = torch.arange(len(base_color), device=base_color.device) if target.place is None else target.place
     point = _one_point_each(place)
-    log_gain = torch.zeros_like(base_color[:1] if known else base_color[point], requires_grad=True)
+    base_color = base_color[point]
+    log_gain = torch.zeros_like(base_color[:1] if known else base_color, requires_grad=True)
     nearest = None if known else nearest_points(target.position[point])
     groups = [{"params": [u.value], "lr": u.rate} for u in (*unknowns, Unknown(log_gain, gain_rate))]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
@@ -81,7 +82,7 @@ def descend(
             gain = (log_gain if scale is None else log_gain - log_gain.mean() + scale).exp()
             loss = loss_of(gain if known else gain[place])
             if nearest is not None:
-                loss = loss + EVENNESS * unevenness(base_color[point] * gain, nearest)
+                loss = loss + EVENNESS * unevenness(base_color * gain, nearest)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from neilfpp_method.effects.places.data import PlaceData, with_lamps
+from neilfpp_method.effects.places.data import PlaceData, lamp_light
 from neilfpp_method.effects.places.fit import PlaceFit, mean_errors
 from neilfpp_method.effects.places.gathering import Split
 from neilfpp_method.fields.lamps import Lamps
@@ -46,7 +46,8 @@ class LampTrial:
             scene: traces shadow rays; None if inter-reflection is off.
         """
         known, held_back = (
-            with_lamps(data, lamps, lobe, scene) for data in (self.split.known, self.split.held_back)
+            data.with_light(lamp_light(data.places, lamps, lobe, scene))
+            for data in (self.split.known, self.split.held_back)
         )
         without = mean_errors(self.refit(self.split.known), self.split.held_back)
         gain = without - mean_errors(self.refit(known), held_back)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from neilfpp_method.effects.places.gathering import Places, Split
@@ -20,7 +21,7 @@ from neilfpp_method.lighting.transport import Transport
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import SceneTracer
 
-__all__ = ["PlaceData", "place_transport", "with_lamps"]
+__all__ = ["PlaceData", "lamp_light", "place_transport"]
 
 ROWS = 16
 """Rows of the map, whose texels are 11° high. Finer detail is left to training, which uses more pixels."""
@@ -53,6 +54,10 @@ class PlaceData:
         rows = self.places.fold_rows(fold, folds)
         return Split(self.where(rows.known), self.where(rows.held_back))
 
+    def with_light(self, layers: Float[Tensor, "K N 3"]) -> PlaceData:
+        """The same data with more light of known radiance, which is added to that of the scene."""
+        return replace(self, transport=replace(self.transport, scene=self.transport.scene + layers))
+
 
 @torch.no_grad()
 def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Transport:
@@ -72,16 +77,14 @@ def place_transport(places: Places, lobe: Lobe, scene: SceneTracer | None) -> Tr
 
 
 @torch.no_grad()
-def with_lamps(data: PlaceData, lamps: Lamps, lobe: Lobe, scene: SceneTracer | None) -> PlaceData:
-    """The same data with the light of lamps, which is added to the light that the scene sends.
+def lamp_light(places: Places, lamps: Lamps, lobe: Lobe, scene: SceneTracer | None) -> Float[Tensor, "K N 3"]:
+    """The layers of the N pixels of places that lamps cause, in radiance (`PlaceData.with_light`).
 
     Args:
-        data: the places.
-        lamps: the lamps.
-        lobe: the specular lobe of `data`.
+        places: the places with their pixels.
+        lamps: the lamps; the layers are proportional to their intensities.
+        lobe: the specular lobe.
         scene: traces shadow rays; None if inter-reflection is off.
     """
-    observed = data.places.observed
-    sight = in_sight(lamps.lit_places, lamps.radius, observed.position, scene)
-    added = lamp_layers(lamps, sight, observed, ROUGHNESSES, lobe)
-    return replace(data, transport=replace(data.transport, scene=data.transport.scene + added))
+    sight = in_sight(lamps.lit_places, lamps.radius, places.observed.position, scene)
+    return lamp_layers(lamps, sight, places.observed, ROUGHNESSES, lobe)
