@@ -79,9 +79,9 @@ def on_grid(
     return Material(base_color, *values)
 
 
-def neighbors(features: Float[Tensor, "P F"], share: float) -> Int[Tensor, "P M"]:
-    """Indices of the nearest places of each place, including itself: this share of all places."""
-    count = max(1, min(len(features), round(share * len(features))))
+def neighbors(features: Float[Tensor, "P F"], count: float) -> Int[Tensor, "P M"]:
+    """Indices of the nearest places of each place, including itself: this count, rounded."""
+    count = max(1, min(len(features), round(count)))
     return torch.cdist(features, features).topk(count, largest=False).indices
 
 

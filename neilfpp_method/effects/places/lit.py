@@ -35,8 +35,10 @@ PAINT_OR_METAL = range(0, len(METALLICS), len(METALLICS) - 1)
 light on brighter, slightly metallic surfaces explains the pixels nearly as well: under the true map of
 `tabletop_env`, held-back views preferred a mean base colour of 0.38 in place of 0.29, and without them 0.31.
 """
-NEIGHBORS_SHARE = 1 / 150
-"""Share of the places whose errors are added when the material of a place is chosen."""
+NEIGHBOR_PIXELS = 150
+"""Pixels whose errors are added when the material of a place is chosen: those of the place and of its nearest
+places. An attached loop has few pixels of each place.
+"""
 COLOR_SCALE = 0.2
 """Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
 of the same look are often of one material.
@@ -115,7 +117,7 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     places, seed = places.only_shown(), int(torch.randint(2**31, ()))
     position = places.shared_points().position
     look = COLOR_SCALE * model.brdf(position).base_color.clamp_min(DARK_FLOOR).log()
-    near = neighbors(torch.cat((position, look), -1), NEIGHBORS_SHARE)
+    near = neighbors(torch.cat((position, look), -1), NEIGHBOR_PIXELS * places.count / len(places.place))
     layers = _layers(model, places, model.lobe, seed)
     return LitPlaces(places, layers, near, model.facts.median_radiance, seed)
 

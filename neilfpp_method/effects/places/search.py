@@ -101,7 +101,7 @@ STEPS = 150
 BATCH = 4096
 """Points per training step of the field."""
 RATE = 5e-3
-"""Learning rate of the field."""
+"""Initial learning rate of the field. It falls linearly to 0, so that noise of single places averages out."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,8 @@ def teach(brdf: BrdfField, searched: SearchedMaterial) -> None:
     """
     gradients = [parameter.grad for parameter in brdf.parameters()]
     optimizer = torch.optim.Adam(brdf.parameters(), lr=RATE, betas=(0.9, 0.99))
-    for _ in range(STEPS):
+    for step in range(STEPS):
+        optimizer.param_groups[0]["lr"] = RATE * (1 - step / STEPS)
         rows = torch.randint(len(searched.position), (BATCH,), device=searched.position.device)
         material, target = brdf(searched.position[rows]), searched.material[rows]
         loss = sum(

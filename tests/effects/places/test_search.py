@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neilfpp_method.effects.places.gathering import Places
-from neilfpp_method.effects.places.lit import light_up
+from neilfpp_method.effects.places.lit import NEIGHBOR_PIXELS, light_up
 from neilfpp_method.effects.places.search import (
     COMPARISONS,
     Comparison,
@@ -230,3 +230,10 @@ def test_a_given_map_of_any_size_costs_as_many_rays_as_a_small_one(places: Place
     light_up(model, few)
     assert sum(rays) <= 2 * 8 * 64 * 128
     torch.testing.assert_close(mean_parts(model, few), expected, rtol=0.05, atol=1e-3)
+
+
+def test_the_material_of_a_place_is_decided_by_about_as_many_pixels_of_few_or_many_views(places: Places):
+    for views in (2, VIEWS):
+        lit = light_up(trained_to(PAINT, places), places.where((places.view < views).nonzero()[:, 0]))
+        pixels_of_a_place = len(lit.places.place) / lit.places.count
+        assert lit.near.shape[1] * pixels_of_a_place == pytest.approx(NEIGHBOR_PIXELS, rel=0.1)
