@@ -141,7 +141,7 @@ def fit_places(
     places = data.places
     base_color = permitted.mean_base_color or START_BASE_COLOR
     fit = _even_start(data, base_color) if start is None else start
-    near = neighbors(places.mean(places.observed.position), NEIGHBORS_SHARE * places.count)
+    near = neighbors(places.mean(places.observed.position), max(1, round(NEIGHBORS_SHARE * places.count)))
     metallics = range(len(METALLICS) if permitted.metals else 1)
     for turn in range(rounds):
         steps = FIRST_STEPS if start is None and turn == 0 else STEPS

@@ -79,9 +79,8 @@ def on_grid(
     return Material(base_color, *values)
 
 
-def neighbors(features: Float[Tensor, "P F"], count: float) -> Int[Tensor, "P M"]:
-    """Indices of the nearest places of each place, including itself: this count, rounded."""
-    count = max(1, min(len(features), round(count)))
+def neighbors(features: Float[Tensor, "P F"], count: int) -> Int[Tensor, "P M"]:
+    """Indices of so many nearest places of each place, including itself."""
     return torch.cdist(features, features).topk(count, largest=False).indices
 
 

@@ -26,7 +26,7 @@ from neilfpp_method.model import NeilfModel
 from neilfpp_method.shading.brdf import Lobe
 from neilfpp_method.structures import Material
 
-__all__ = ["METAL", "PAINT", "PAINT_OR_METAL", "LitPlaces", "light_up", "with_lobe"]
+__all__ = ["METAL", "PAINT", "PAINT_OR_METAL", "LitPlaces", "light_up", "neighbor_count", "with_lobe"]
 
 PAINT, METAL = range(1), range(1, len(METALLICS))
 """Indices in `METALLICS` of paint and of everything that is metallic."""
@@ -39,6 +39,8 @@ NEIGHBOR_PIXELS = 150
 """Pixels whose errors are added when the material of a place is chosen: those of the place and of its nearest
 places. An attached loop has few pixels of each place.
 """
+MAX_NEIGHBORS_SHARE = 1 / 100
+"""Largest share of the places that these are. A larger part of the object is often of several materials."""
 COLOR_SCALE = 0.2
 """Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
 of the same look are often of one material.
@@ -105,6 +107,11 @@ class LitPlaces:
         return mean_loss(self.error(material), self.places, self.near)
 
 
+def neighbor_count(places: int, pixels: int) -> int:
+    """Number of nearest places, including itself, whose errors decide on the material of a place."""
+    return max(1, round(places * min(NEIGHBOR_PIXELS / pixels, MAX_NEIGHBORS_SHARE)))
+
+
 @torch.no_grad()
 def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     """Trace the light of a model, which has an environment map, to the pixels of places.
@@ -117,7 +124,8 @@ def light_up(model: NeilfModel, places: Places) -> LitPlaces:
     places, seed = places.only_shown(), int(torch.randint(2**31, ()))
     position = places.shared_points().position
     look = COLOR_SCALE * model.brdf(position).base_color.clamp_min(DARK_FLOOR).log()
-    near = neighbors(torch.cat((position, look), -1), NEIGHBOR_PIXELS * places.count / len(places.place))
+    count = neighbor_count(places.count, len(places.place))
+    near = neighbors(torch.cat((position, look), -1), count)
     layers = _layers(model, places, model.lobe, seed)
     return LitPlaces(places, layers, near, model.facts.median_radiance, seed)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neilfpp_method.effects.places.gathering import Places
-from neilfpp_method.effects.places.lit import NEIGHBOR_PIXELS, light_up
+from neilfpp_method.effects.places.lit import NEIGHBOR_PIXELS, light_up, neighbor_count
 from neilfpp_method.effects.places.search import (
     COMPARISONS,
     Comparison,
@@ -232,8 +232,12 @@ def test_a_given_map_of_any_size_costs_as_many_rays_as_a_small_one(places: Place
     torch.testing.assert_close(mean_parts(model, few), expected, rtol=0.05, atol=1e-3)
 
 
-def test_the_material_of_a_place_is_decided_by_about_as_many_pixels_of_few_or_many_views(places: Places):
-    for views in (2, VIEWS):
-        lit = light_up(trained_to(PAINT, places), places.where((places.view < views).nonzero()[:, 0]))
-        pixels_of_a_place = len(lit.places.place) / lit.places.count
-        assert lit.near.shape[1] * pixels_of_a_place == pytest.approx(NEIGHBOR_PIXELS, rel=0.1)
+@pytest.mark.parametrize("pixels_of_a_place", [9, 18])
+def test_the_material_of_a_place_is_decided_by_as_many_pixels_of_few_or_many_views(pixels_of_a_place: int):
+    count = neighbor_count(2000, 2000 * pixels_of_a_place)
+    assert count * pixels_of_a_place == pytest.approx(NEIGHBOR_PIXELS, rel=0.05)
+
+
+def test_a_place_of_a_small_capture_is_decided_alone():
+    """Its neighbours are a large part of the object, so that they are often of another material."""
+    assert neighbor_count(120, 120 * 8) == 1
