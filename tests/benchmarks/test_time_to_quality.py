@@ -20,6 +20,7 @@ def measured() -> Curve:
     )
 
 
+@pytest.mark.slow
 def test_measurements_continue_to_the_end_and_include_the_material_stage(measured):
     assert measured.finished
     assert [mark.step for mark in measured.marks] == sorted({mark.step for mark in measured.marks})
@@ -36,6 +37,7 @@ def test_a_time_limit_ends_a_curve_and_is_noted():
     assert list(time_to_quality.charts(Path("scene"), {"tiny": capped})[0].lines) == ["tiny, unfinished"]
 
 
+@pytest.mark.slow
 def test_a_measurement_does_not_change_the_training(measured):
     again = curve(
         demo_scene(), tiny_config(), cap=float("inf"), first=1e9, views=1, device=torch.device("cpu")

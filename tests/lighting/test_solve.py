@@ -82,7 +82,7 @@ def solved(seen: Observed, of: Material, rounds: int, base_color_known: bool = F
 
 
 @pytest.mark.parametrize("true", [BULB, PANEL], ids=["bulb", "panel"])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_lamp_is_found_with_its_position_intensity_and_kind(true, known):
     """Known base colours may vary arbitrarily; unknown ones are constant except for edges."""
     lamps, _ = solved(*photographed(true, speckled=known), rounds=3, base_color_known=known)

@@ -112,6 +112,7 @@ def test_no_budget_is_large_enough(tmp_path, words, clock, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_budget_that_an_earlier_run_has_shown_to_be_too_small_is_not_tried(words, clock, capsys):
     """The trial of 1s shows that 14.5 s are needed; its second seed and 10s are refused without a trial."""
     assert main([*words, "--budgets", "1s,10s,2m", "--seeds", "2"]) == 0
@@ -122,6 +123,7 @@ def test_a_budget_that_an_earlier_run_has_shown_to_be_too_small_is_not_tried(wor
         assert f": {name}\n" not in said
 
 
+@pytest.mark.slow
 def test_relit_views_are_compared_without_another_training(tmp_path, words, clock, monkeypatch, capsys):
     monkeypatch.setattr(relighting, "RelightRequest", partial(RelightRequest, resolution=32))
     out, words = tmp_path / "out", [*words, "--budgets", "2m,3m"]

@@ -120,6 +120,7 @@ def test_a_stop_ends_both_processes_after_the_same_step(tmp_path, capture):
     assert complaint.endswith(f"continue with: neilfpp train --out {out} --resume --device cpu --devices 2\n")
 
 
+@pytest.mark.slow
 def test_two_nodes_end_with_one_model(tmp_path, capture):
     """torchrun starts one process for each of two nodes, here on one machine."""
     out, port = tmp_path / "run", free_port()

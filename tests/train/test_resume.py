@@ -287,6 +287,7 @@ def test_weights_that_do_not_fit_the_settings_are_refused(tmp_path, capture, mon
 # ---------------------------------------------------------------------------------------------- a real Ctrl-C
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_a_real_terminal_session(tmp_path, capture):
     """The process prints in one line how to continue and ends with 130; that line, typed unchanged, continues
     the run.

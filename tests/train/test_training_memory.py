@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from neilfpp_method.cli import main
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.train.memory import training_bytes
@@ -43,6 +45,7 @@ def peak(data: Path, out: Path) -> int:
     return int(done.stdout.split("PEAK ")[1])
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_single_views(tmp_path: Path) -> None:
     """48 views of 1 megapixel, which would need 0.9 GB at 19 bytes per pixel, need no more than a few views
     do.
