@@ -109,7 +109,7 @@ class LitPlaces:
 
 def neighbor_count(places: int, pixels: int) -> int:
     """Number of nearest places, including itself, whose errors decide on the material of a place."""
-    return max(1, round(places * min(NEIGHBOR_PIXELS / pixels, MAX_NEIGHBORS_SHARE)))
+    return max(1, int(places * min(NEIGHBOR_PIXELS / pixels, MAX_NEIGHBORS_SHARE)))
 
 
 @torch.no_grad()
