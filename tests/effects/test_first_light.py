@@ -68,7 +68,6 @@ def alternatives_of(places: Places, response: str = "linear") -> Alternatives:
     )
 
 
-@pytest.mark.slow
 def test_held_back_views_identify_the_lobe_of_the_images():
     # With half as many places the result depended on rounding, so on the processor.
     torch.manual_seed(0)

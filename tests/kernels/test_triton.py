@@ -42,7 +42,6 @@ def python(*arguments: str, **environment: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="this is the inner run")
 def test_the_tests_of_every_backend_hold_in_the_interpreter():
     here = Path(__file__).parent.relative_to(ROOT)

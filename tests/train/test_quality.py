@@ -33,7 +33,6 @@ def train_here(data, out, resume=False, **settings):
     run_training(TrainingRequest(data, out, config, resume, device="cpu"), Console(quiet=True))
 
 
-@pytest.mark.slow
 def test_checks_do_not_change_the_training_and_continue_after_a_stop(tmp_path, capture, monkeypatch):
     """Checks after every step, checks only at the ends of stages, and a stopped run."""
     train_here(capture, tmp_path / "seldom")

@@ -80,7 +80,7 @@ def on_grid(
 
 
 def neighbors(features: Float[Tensor, "P F"], count: int) -> Int[Tensor, "P M"]:
-    """Indices of so many nearest places of each place, including itself."""
+    """Indices of the `count` nearest places of each place, including itself."""
     return torch.cdist(features, features).topk(count, largest=False).indices
 
 

@@ -36,11 +36,13 @@ light on brighter, slightly metallic surfaces explains the pixels nearly as well
 `tabletop_env`, held-back views preferred a mean base colour of 0.38 in place of 0.29, and without them 0.31.
 """
 NEIGHBOR_PIXELS = 150
-"""Pixels whose errors are added when the material of a place is chosen: those of the place and of its nearest
-places. An attached loop has few pixels of each place.
+"""Number of pixels whose errors are added when the material of a place is chosen: those of the place and of
+its nearest places. An attached loop has few pixels of each place, so it needs more places.
 """
 MAX_NEIGHBORS_SHARE = 1 / 100
-"""Largest share of the places that these are. A larger part of the object is often of several materials."""
+"""Largest number of those places, as a share of all places. A larger part of the object is often of several
+materials.
+"""
 COLOR_SCALE = 0.2
 """Distance in scene units that counts as much as a factor e of base colour when neighbours are chosen: places
 of the same look are often of one material.
@@ -108,7 +110,12 @@ class LitPlaces:
 
 
 def neighbor_count(places: int, pixels: int) -> int:
-    """Number of nearest places, including itself, whose errors decide on the material of a place."""
+    """Number of places whose errors decide on the material of a place: itself and its nearest ones.
+
+    Args:
+        places: number of all places.
+        pixels: number of pixels of all places together.
+    """
     return max(1, int(places * min(NEIGHBOR_PIXELS / pixels, MAX_NEIGHBORS_SHARE)))
 
 

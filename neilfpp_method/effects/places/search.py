@@ -192,8 +192,10 @@ def teach(brdf: BrdfField, searched: SearchedMaterial) -> None:
     """
     gradients = [parameter.grad for parameter in brdf.parameters()]
     optimizer = torch.optim.Adam(brdf.parameters(), lr=RATE, betas=(0.9, 0.99))
-    for step in range(STEPS):
-        optimizer.param_groups[0]["lr"] = RATE * (1 - step / STEPS)
+    schedule = torch.optim.lr_scheduler.LinearLR(
+        optimizer, start_factor=1.0, end_factor=0.0, total_iters=STEPS
+    )
+    for _ in range(STEPS):
         rows = torch.randint(len(searched.position), (BATCH,), device=searched.position.device)
         material, target = brdf(searched.position[rows]), searched.material[rows]
         loss = sum(
@@ -203,5 +205,6 @@ def teach(brdf: BrdfField, searched: SearchedMaterial) -> None:
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
+        schedule.step()
     for parameter, gradient in zip(brdf.parameters(), gradients, strict=True):
         parameter.grad = gradient
