@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64, Int64
 from scipy import ndimage
 from torch import Tensor
 
@@ -45,6 +45,8 @@ MIN_HIDDEN_SHARE = 0.5
 """Smallest share of the views with a cell in the image from which points must hide it."""
 MAX_EMPTY_SHARE = 0.2
 """Largest share of these views that may see a cell as empty. False points and gaps cause some."""
+PART = 2**16
+"""Number of cells that are examined at once, so that their numbers stay in the processor's cache."""
 
 
 def find_cloud_hull(
@@ -71,30 +73,47 @@ def find_cloud_hull(
     points = points.to("cpu")
     if not len(points.position):
         return NOTHING_HIDDEN
-    # A corner of the cube is seen by few views, all of them from behind the object.
-    in_ball = centers.norm(dim=-1) < radius + MARGIN * cell
-    views, hidden, empty = torch.zeros(3, len(centers))
-    point_views = torch.zeros(len(points.position))
-    for camera in cameras:
-        camera = _reduced(camera)
-        projected = project(camera, centers)
-        index = pixel_index(projected, camera)
-        in_image = index >= 0
-        first = torch.where(in_image, _depth_map(camera, points).flatten()[index], torch.inf)
-        in_front = projected.depth < first - TOLERANCE * cell
-        known = first.isfinite()
-        views += in_image
-        point_views += pixel_index(project(camera, points.position), camera) >= 0
-        empty += known & in_front
-        hidden += known & ~in_front
+    views = [(camera, _depth_map(camera, points)) for camera in map(_reduced, cameras)]
     # Cameras around an object show all points, those that look around in a room a few each.
-    enough_views = views >= max(2, MIN_SEEN_SHARE * point_views.median())
-    hides = (hidden >= MIN_HIDDEN_SHARE * views) & (empty <= MAX_EMPTY_SHARE * views)
-    solid = in_ball & enough_views & hides
+    shown_in = sum(
+        (pixel_index(project(camera, points.position), camera) >= 0).float() for camera, _ in views
+    )
+    least_views = max(2.0, float(MIN_SEEN_SHARE * shown_in.median()))
+    # A corner of the cube is seen by few views, all of them from behind the object.
+    in_ball = torch.nonzero(centers.norm(dim=-1) < radius + MARGIN * cell)[:, 0]
+    solid = torch.zeros(len(centers), dtype=torch.bool)
+    for part in in_ball.split(PART):
+        solid[part[_hidden(views, centers[part], least_views, TOLERANCE * cell)]] = True
     if solid.sum() < MIN_CELLS:
         return NOTHING_HIDDEN
     cube = solid.numpy().reshape(resolution, resolution, resolution)
     return DistanceCube(torch.from_numpy(signed_distance(cube, cell)), radius)
+
+
+def _hidden(
+    views: Sequence[tuple[Camera, Float[Tensor, "H W"]]],
+    centers: Float64[Tensor, "P 3"],
+    least_views: float,
+    tolerance: float,
+) -> Int64[Tensor, " K"]:
+    """Indices of the cells that are in enough images, and that points hide in nearly all of them."""
+    index = torch.arange(len(centers))
+    seen, hidden, empty = torch.zeros(3, len(centers))
+    for camera, depth_map in views:
+        projected = project(camera, centers[index])
+        pixel = pixel_index(projected, camera)
+        in_image = pixel >= 0
+        first = torch.where(in_image, depth_map.flatten()[pixel], torch.inf)
+        in_front = projected.depth < first - tolerance
+        known = first.isfinite()
+        seen, hidden, empty = seen + in_image, hidden + (known & ~in_front), empty + (known & in_front)
+        # What so many views contradict cannot be hidden, whatever the others show. Most cells are.
+        possible = (seen - hidden <= (1 - MIN_HIDDEN_SHARE) * len(views)) & (
+            empty <= MAX_EMPTY_SHARE * len(views)
+        )
+        index, seen, hidden, empty = (values[possible] for values in (index, seen, hidden, empty))
+    hides = (hidden >= MIN_HIDDEN_SHARE * seen) & (empty <= MAX_EMPTY_SHARE * seen)
+    return index[hides & (seen >= least_views)]
 
 
 def _reduced(camera: Camera) -> Camera:
