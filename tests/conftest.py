@@ -1,11 +1,14 @@
-"""Captures that tests of several folders read. No test may change them."""
+"""Captures that tests of several folders read, which no test may change; and a short start of trainings."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from neilfpp_method.train import command
+from tests.coarse_hulls import start_geometry
 from tests.data.make_capture import make_capture
 
 
@@ -19,3 +22,11 @@ def sphere_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def masked_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same capture with masks."""
     return make_capture(tmp_path_factory.mktemp("capture") / "sphere", masks=True)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _coarse_hulls() -> Iterator[None]:
+    """Trainings of tiny fields start from coarse hulls."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "start_geometry", start_geometry)
+        yield

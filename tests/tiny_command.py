@@ -1,5 +1,5 @@
 """The command line with one more preset, `tiny`, for runs in other processes: `python -m tests.tiny_command
-train …`.
+train …`. They start from coarse hulls, as in the process of the tests.
 
 With TINY_RECORD=FOLDER every process also writes what it computed: `gradients_RANK.pt` of the first step, as
 the optimizer sees them, and `parameters_RANK.pt` at the end.
@@ -16,6 +16,7 @@ import torch
 from neilfpp_method.cli import main
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train import command, loop
+from tests.coarse_hulls import start_geometry
 from tests.train.small_runs import small_config
 
 
@@ -39,6 +40,7 @@ def record(folder: Path) -> None:
 
 if __name__ == "__main__":
     PRESETS["tiny"] = small_config
+    command.start_geometry = start_geometry
     if "TINY_RECORD" in os.environ:
         record(Path(os.environ["TINY_RECORD"]))
     sys.exit(main())

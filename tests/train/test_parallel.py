@@ -21,7 +21,7 @@ from neilfpp_method.schedule import Stage, active_losses, weigh
 from neilfpp_method.settings.presets import PRESETS
 from neilfpp_method.train.checkpoint import last_checkpoint
 from neilfpp_method.train.optimizer import seed_step
-from neilfpp_method.train.start import start_geometry
+from tests.coarse_hulls import start_geometry
 from tests.train.small_runs import differences, small_config, small_training
 
 REPOSITORY = Path(__file__).parents[2]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import io
 from pathlib import Path
 
@@ -14,20 +13,19 @@ from rich.console import Console
 
 from neilfpp_method.data.capture import load_capture
 from neilfpp_method.data.files.images import write_png
-from neilfpp_method.data.hulls.cloud_hull import find_cloud_hull
-from neilfpp_method.data.hulls.visual_hull import find_hull
 from neilfpp_method.data.pixels.dataset import PixelDataset
 from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.schedule import Stage, StagePosition
 from neilfpp_method.settings.plain import changed
 from neilfpp_method.settings.types import NeilfConfig
-from neilfpp_method.train import command, start
+from neilfpp_method.train import command
 from neilfpp_method.train.build import build_model, scene_facts
 from neilfpp_method.train.checkpoint import last_checkpoint, save_checkpoint
 from neilfpp_method.train.optimizer import make_optimizer, seed_step, waiting_fields
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.start import GeometryStart, start_geometry
+from tests.coarse_hulls import make_coarse
 from tests.data.make_capture import RADIUS, SCALE, make_capture
 from tests.train.small_runs import small_config
 
@@ -37,12 +35,7 @@ SIZE = (64, 48)
 
 @pytest.fixture(autouse=True)
 def cheap(monkeypatch) -> None:
-    """A coarser hull and a shorter fit, sufficient for tiny fields."""
-    monkeypatch.setattr(start, "find_hull", functools.partial(find_hull, resolution=40))
-    monkeypatch.setattr(start, "find_cloud_hull", functools.partial(find_cloud_hull, resolution=40))
-    monkeypatch.setattr(start, "STEPS", 100)
-    monkeypatch.setattr(start, "POINTS", 512)
-    monkeypatch.setattr(start, "POOL", 8192)
+    make_coarse(monkeypatch)
 
 
 @pytest.fixture
