@@ -1,4 +1,4 @@
-"""Captures that tests of several folders read, which no test may change; and a short start of trainings."""
+"""Captures that no test may change; trainings that start soon, and checks of the shapes of first calls."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from pathlib import Path
 import pytest
 
 from neilfpp_method.train import command
+from tests import shape_checks
 from tests.coarse_hulls import start_geometry
 from tests.data.make_capture import make_capture
+
+
+def pytest_runtest_setup() -> None:
+    shape_checks.start_test()
 
 
 @pytest.fixture(scope="session")
