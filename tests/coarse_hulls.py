@@ -25,7 +25,7 @@ def make_coarse(patch: pytest.MonkeyPatch) -> None:
     """Use a coarser hull and a shorter fit, sufficient for tiny fields."""
     patch.setattr(start, "find_hull", functools.partial(find_hull, resolution=40))
     patch.setattr(start, "find_cloud_hull", functools.partial(find_cloud_hull, resolution=40))
-    patch.setattr(start, "STEPS", 100)
+    patch.setattr(start, "STEPS", 200)
     patch.setattr(start, "POINTS", 512)
     patch.setattr(start, "POOL", 8192)
 

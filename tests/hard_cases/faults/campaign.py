@@ -29,7 +29,9 @@ from neilfpp_method.cli import main as neilfpp
 from neilfpp_method.data.files.images import write_exr
 from neilfpp_method.prepare.layout import WORK
 from neilfpp_method.settings.presets import PRESETS
+from neilfpp_method.train import command as train_command
 from neilfpp_method.train.checkpoint import last_checkpoint
+from tests.coarse_hulls import start_geometry
 from tests.data.make_capture import make_capture
 from tests.hard_cases.faults.whole_files import check_whole, comparable_files, visible_files
 from tests.prepare.textured_corner import make_photos
@@ -271,6 +273,7 @@ def capture_files(out: Path) -> dict[str, bytes]:
 
 def main(folder: Path, report_file: Path, seed: int, kills: int) -> None:
     PRESETS["tiny"] = small_config
+    train_command.start_geometry = start_geometry
     draw, report = random.Random(seed), Report()
     make_capture(folder / "capture", masks=True)
     whole = attack_training(report, folder, draw, kills)
