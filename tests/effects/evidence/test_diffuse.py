@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neilfpp_method.effects.places.gathering import Places
-from neilfpp_method.effects.places.lit import light_up
+from neilfpp_method.effects.places.lit import LitPlaces, light_up
 from neilfpp_method.effects.plan import Plan
 from neilfpp_method.effects.request import parse_effects
 from neilfpp_method.effects.review import review_diffuse
@@ -48,6 +48,13 @@ def test_the_lobe_of_the_images_is_recognised(lobe):
     assert model.lobe is LOBES[lobe]
 
 
+@pytest.fixture(scope="module")
+def rough_diffuse() -> tuple[Places, LitPlaces]:
+    """Places of a rough diffuse lobe, also under the light of a half-trained model."""
+    places = smooth_paint("ggx_burley")
+    return places, light_up(half_trained(places)[1], places)
+
+
 @pytest.mark.parametrize(
     ("effects", "lobe"),
     [
@@ -59,11 +66,10 @@ def test_the_lobe_of_the_images_is_recognised(lobe):
         ("auto,-long-tails", "ggx"),
     ],
 )
-def test_what_is_on_or_decided_stays(effects, lobe):
-    places = smooth_paint("ggx_burley")
+def test_what_is_on_or_decided_stays(rough_diffuse, effects, lobe):
+    places, lit = rough_diffuse
     plan, model = half_trained(places, effects, lobe)
     before = model.config.shading.lobe
-    lit = light_up(half_trained(places)[1], places)
     assert review_diffuse(plan, model, lit, 1000) == []
     assert model.config.shading.lobe == before
 
