@@ -11,6 +11,8 @@ import pytest
 
 pytest.importorskip("triton")
 ROOT = Path(__file__).parents[2]
+OF_EVERY_BACKEND = ("tests/kernels/test_backends.py", "tests/kernels/test_encode.py")
+"""The files of which the environment selects the backend."""
 COMPILE = """
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource, compile
@@ -42,19 +44,14 @@ def python(*arguments: str, **environment: str) -> str:
     return done.stdout
 
 
-@pytest.mark.skipif(os.environ.get("TRITON_INTERPRET") == "1", reason="this is the inner run")
 def test_the_tests_of_every_backend_hold_in_the_interpreter():
-    here = Path(__file__).parent.relative_to(ROOT)
-    told = python(
-        "-m", "pytest", "-x", "-p", "no:cacheprovider", str(here), TRITON_INTERPRET="1", OMP_NUM_THREADS="1"
-    )
+    words = ("-m", "pytest", "-x", "-p", "no:cacheprovider", *OF_EVERY_BACKEND)
+    told = python(*words, TRITON_INTERPRET="1", OMP_NUM_THREADS="1")
     assert "passed" in told
     assert "failed" not in told
 
 
-@pytest.mark.skipif(
-    sys.platform != "linux" or os.environ.get("TRITON_INTERPRET") == "1", reason="needs Triton's compiler"
-)
+@pytest.mark.skipif(sys.platform != "linux", reason="needs Triton's compiler")
 def test_the_kernels_compile_for_a_gpu(tmp_path):
     sizes = python("-c", COMPILE, TRITON_CACHE_DIR=str(tmp_path), TRITON_INTERPRET="0").split()
     assert len(sizes) == 6
