@@ -19,7 +19,7 @@ from neilfpp_method.train.quality import FILE, MAX_SHARE, Quality, QualityCheck,
 from neilfpp_method.train.request import TrainingRequest
 from tests.data.make_capture import make_capture
 from tests.scenes import sphere_batch, sphere_model
-from tests.train.small_runs import differences, small_config, small_training, solved_light
+from tests.train.small_runs import differences, short_light_fits, small_config, small_training, solved_light
 from tests.train.test_resume import interrupt_at, state
 
 
@@ -33,6 +33,7 @@ def train_here(data, out, resume=False, **settings):
     run_training(TrainingRequest(data, out, config, resume, device="cpu"), Console(quiet=True))
 
 
+@short_light_fits()
 def test_checks_do_not_change_the_training_and_continue_after_a_stop(tmp_path, capture, monkeypatch):
     """Checks after every step, checks only at the ends of stages, and a stopped run."""
     train_here(capture, tmp_path / "seldom")

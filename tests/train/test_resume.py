@@ -29,7 +29,7 @@ from neilfpp_method.train.command import run_training
 from neilfpp_method.train.request import TrainingRequest
 from neilfpp_method.train.run import load_run, read_description
 from tests.data.make_capture import make_capture
-from tests.train.small_runs import differences, small_config, solved_light
+from tests.train.small_runs import differences, short_light_fits, small_config, solved_light
 
 # Four steps in each of three stages: 0–3, 4–7, 8–11.
 STEPS = 12
@@ -76,9 +76,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory, capture: Path) -> Path:
     return out
 
 
+# `test_many_stops_change_nothing` also stops in the steps of the slow cases, or in the one after.
 @pytest.mark.parametrize(
     ("asked", "stops"),
-    [(0, 1), (1, 2), (2, 3), (4, 5), (6, 7), (8, 9), (10, 11), (3, 5), (7, 9)],
+    [
+        *[(0, 1), (2, 3), (4, 5), (10, 11), (3, 5), (7, 9)],
+        *[pytest.param(*case, marks=pytest.mark.slow) for case in ((1, 2), (6, 7), (8, 9))],
+    ],
     ids=lambda value: str(value),
 )
 def test_a_stop_in_any_stage_changes_nothing(tmp_path, capture, whole, monkeypatch, asked, stops):
@@ -333,6 +337,7 @@ def _start(command: list[str]) -> subprocess.Popen[str]:
 # ---------------------------------------------------------------------------------------------------- effects
 
 
+@short_light_fits()
 def test_decisions_by_evidence_are_read_from_the_run(tmp_path, capture, monkeypatch):
     """A ball does not occlude itself, so nothing is traced after SDF init, in a stopped run as in an
     uninterrupted one.
