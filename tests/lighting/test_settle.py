@@ -106,10 +106,16 @@ def test_two_lamps_stay_separate_and_move_to_their_positions(base_color_known):
     torch.testing.assert_close(found.intensity, TRUE.intensity, rtol=0.1, atol=0)
 
 
+# `test_two_lamps_stay_separate_and_move_to_their_positions` also starts with lamps of the right kinds.
 @pytest.mark.parametrize(
-    "start", [torch.zeros(3), torch.tensor([0.6, 0.0, -0.8])], ids=["from a bulb", "from a panel"]
+    ("number", "start"),
+    [
+        pytest.param(0, TRUE.places.axis[1], id="a bulb from a panel"),
+        pytest.param(1, TRUE.places.axis[0], id="a panel from a bulb"),
+        pytest.param(0, TRUE.places.axis[0], id="a bulb from a bulb", marks=pytest.mark.slow),
+        pytest.param(1, TRUE.places.axis[1], id="a panel from a panel", marks=pytest.mark.slow),
+    ],
 )
-@pytest.mark.parametrize("number", [0, 1], ids=["a bulb", "a panel"])
 def test_a_lamp_is_of_the_kind_that_explains_the_points(number, start):
     row = slice(number, number + 1)
     true = FoundLamps(TRUE.places[row], TRUE.intensity[row])

@@ -168,7 +168,7 @@ def test_under_only_a_known_sky_no_lamp_is_lit():
     assert light.lamps.count == 0
 
 
-@pytest.mark.parametrize("count", [1, 3, 5])
+@pytest.mark.parametrize("count", [1, 3, pytest.param(5, marks=pytest.mark.slow)])
 def test_too_few_points_give_no_lamp(count):
     """Of a few points none or one is held back: the evidence is finite, so that JSON can store it."""
     seen, of = photographed(None)
