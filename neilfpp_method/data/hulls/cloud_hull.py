@@ -78,12 +78,12 @@ def find_cloud_hull(
     shown_in = sum(
         (pixel_index(project(camera, points.position), camera) >= 0).float() for camera, _ in views
     )
-    least_views = max(2.0, float(MIN_SEEN_SHARE * shown_in.median()))
+    min_views = max(2.0, float(MIN_SEEN_SHARE * shown_in.median()))
     # A corner of the cube is seen by few views, all of them from behind the object.
     in_ball = torch.nonzero(centers.norm(dim=-1) < radius + MARGIN * cell)[:, 0]
     solid = torch.zeros(len(centers), dtype=torch.bool)
     for part in in_ball.split(PART):
-        solid[part[_hidden(views, centers[part], least_views, TOLERANCE * cell)]] = True
+        solid[part[_hidden(views, centers[part], min_views, TOLERANCE * cell)]] = True
     if solid.sum() < MIN_CELLS:
         return NOTHING_HIDDEN
     cube = solid.numpy().reshape(resolution, resolution, resolution)
@@ -93,12 +93,12 @@ def find_cloud_hull(
 def _hidden(
     views: Sequence[tuple[Camera, Float[Tensor, "H W"]]],
     centers: Float64[Tensor, "P 3"],
-    least_views: float,
+    min_views: float,
     tolerance: float,
 ) -> Int64[Tensor, " K"]:
     """Indices of the cells that are in enough images, and that points hide in nearly all of them."""
     index = torch.arange(len(centers))
-    seen, hidden, empty = torch.zeros(3, len(centers))
+    imaged, hidden, empty = torch.zeros(3, len(centers))
     for camera, depth_map in views:
         projected = project(camera, centers[index])
         pixel = pixel_index(projected, camera)
@@ -106,14 +106,14 @@ def _hidden(
         first = torch.where(in_image, depth_map.flatten()[pixel], torch.inf)
         in_front = projected.depth < first - tolerance
         known = first.isfinite()
-        seen, hidden, empty = seen + in_image, hidden + (known & ~in_front), empty + (known & in_front)
-        # What so many views contradict cannot be hidden, whatever the others show. Most cells are.
-        possible = (seen - hidden <= (1 - MIN_HIDDEN_SHARE) * len(views)) & (
+        imaged, hidden, empty = imaged + in_image, hidden + (known & ~in_front), empty + (known & in_front)
+        # Most cells are contradicted by so many views that the other views need not be examined.
+        possible = (imaged - hidden <= (1 - MIN_HIDDEN_SHARE) * len(views)) & (
             empty <= MAX_EMPTY_SHARE * len(views)
         )
-        index, seen, hidden, empty = (values[possible] for values in (index, seen, hidden, empty))
-    hides = (hidden >= MIN_HIDDEN_SHARE * seen) & (empty <= MAX_EMPTY_SHARE * seen)
-    return index[hides & (seen >= least_views)]
+        index, imaged, hidden, empty = (values[possible] for values in (index, imaged, hidden, empty))
+    hides = (hidden >= MIN_HIDDEN_SHARE * imaged) & (empty <= MAX_EMPTY_SHARE * imaged)
+    return index[hides & (imaged >= min_views)]
 
 
 def _reduced(camera: Camera) -> Camera:
