@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from neilfpp_method.effects.first_lamps import PIXELS, settle_first_lamps
+from neilfpp_method.effects.first_lamps import settle_first_lamps
 from neilfpp_method.effects.first_light import FirstLight
 from neilfpp_method.lighting.fit import Evidence
 from neilfpp_method.lighting.solver import LightSolver
@@ -15,6 +15,12 @@ from neilfpp_method.shading.color import linear_to_srgb
 from neilfpp_method.structures import Material
 
 __all__ = ["start_with"]
+
+PIXELS = 4096
+"""Number of pixels at which lamps are sought. With 1024, the gain by lamps on recovered geometry varied
+between random selections from −0.4 % to 2.9 % in a scene with lamps (standard error 0.5 %); with 4096 from
+1.3 % to 2.3 %.
+"""
 
 
 @torch.no_grad()
