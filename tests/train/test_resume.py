@@ -339,9 +339,7 @@ def _start(command: list[str]) -> subprocess.Popen[str]:
 
 @short_light_fits()
 def test_decisions_by_evidence_are_read_from_the_run(tmp_path, capture, monkeypatch):
-    """A ball does not occlude itself, so nothing is traced after SDF init, in a stopped run as in an
-    uninterrupted one.
-    """
+    """A stopped run decides as an uninterrupted one, and a loaded run has the settings that follow."""
     config = solved_light(small_config())
     asked = parse_effects("auto")
     run(capture, tmp_path / "whole", config, effects=asked)
