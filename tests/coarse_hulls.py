@@ -12,6 +12,7 @@ import pytest
 from neilfpp_method.data.capture import Capture
 from neilfpp_method.data.hulls.cloud_hull import find_cloud_hull
 from neilfpp_method.data.hulls.visual_hull import find_hull
+from neilfpp_method.hosts.volsdf import VolSdfHost
 from neilfpp_method.model import NeilfModel
 from neilfpp_method.settings.types import NeilfConfig
 from neilfpp_method.train import start
@@ -33,6 +34,6 @@ def make_coarse(patch: pytest.MonkeyPatch) -> None:
 def start_geometry(model: NeilfModel, capture: Capture, config: NeilfConfig) -> GeometryStart | None:
     """`train.start.start_geometry`, short for tiny fields."""
     with pytest.MonkeyPatch.context() as patch:
-        if config.host.sdf.width <= TINY_WIDTH:
+        if isinstance(model.host, VolSdfHost) and config.host.sdf.width <= TINY_WIDTH:
             make_coarse(patch)
         return start.start_geometry(model, capture, config)
