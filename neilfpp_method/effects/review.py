@@ -214,7 +214,7 @@ def improve_material(
     lit, summaries = light_up(model, places), []
     rescaled = correct_scale(model, solver, lit)
     if rescaled is not None:
-        lit = rescaled.lit
+        lit = lit.dimmed(rescaled.factor)
         summaries.append(rescaled.summary())
     if comparison is Comparison.MATERIAL and (model.brdf.metals or model.brdf.varying_roughness):
         searched = search_materials(model.brdf, lit)

@@ -34,7 +34,8 @@ class BrdfField(nn.Module):
 
     Roughness starts near ½; base colour and metallic start as the settings say. Without `metals`, metallic is
     0 everywhere and has no gradient. Without `varying_roughness`, roughness is the same everywhere and is
-    learned as the bias of its output; it keeps this value if it is later allowed to vary.
+    learned as the bias of its output; it keeps this value if it is later allowed to vary. Base colour is
+    multiplied by a factor, which is 1 during training (`scale_base_color`).
 
     Args:
         config: the settings of B.
@@ -45,6 +46,8 @@ class BrdfField(nn.Module):
     def __init__(self, config: BrdfConfig, encoding: FrequencyConfig | HashGridConfig, radius: float) -> None:
         super().__init__()
         self.use(config)
+        self.base_color_scale: Tensor
+        self.register_buffer("base_color_scale", torch.ones(()))
         self.encoding = position_encoding(encoding, radius)
         # Sine layers add the detail that a frequency encoding of six octaves lacks (NeILF++ §5).
         activation = "sine" if isinstance(encoding, FrequencyConfig) else "relu"
@@ -88,14 +91,21 @@ class BrdfField(nn.Module):
     def brighten(self, base_color: float, factor: float) -> None:
         """Shift the biases so that this base colour becomes brighter by a factor.
 
-        Darker ones are multiplied by about the same factor. Brighter ones approach 1.
+        Darker ones are multiplied by about the same factor. Brighter ones approach 1. All keep a gradient, so
+        the field can be trained further.
         """
         before, after = (min(value, START_RANGE[1]) for value in (base_color, factor * base_color))
         shift = math.atanh(2 * after - 1) - math.atanh(2 * before - 1)
         self.mlp.layers[-1].bias[:3] += shift
 
+    @torch.no_grad()
+    def scale_base_color(self, factor: float) -> None:
+        """Multiply all base colours by a factor, up to 1, where they have no gradient any more."""
+        self.base_color_scale *= factor
+
     def _material(self, saturation: Float[Tensor, "N 5"]) -> Material:
         base_color, roughness, metallic = (0.5 + 0.5 * saturation).split((3, 1, 1), -1)
+        base_color = (self.base_color_scale * base_color).clamp_max(1.0)
         if not self.varying_roughness:
             roughness = (0.5 + 0.5 * torch.tanh(self.mlp.layers[-1].bias[3:4])).expand_as(roughness)
         return Material(base_color, roughness, metallic if self.metals else torch.zeros_like(metallic))

@@ -31,6 +31,7 @@ from neilfpp_method.settings.types import OptimizerConfig
 from neilfpp_method.structures import LossTerms, PixelBatch, StepResult
 from neilfpp_method.train.deciding import (
     Subject,
+    correct_final_scale,
     improve_half_trained,
     is_improvement_due,
     review_before_material,
@@ -189,6 +190,8 @@ class Steps:
                 CONSOLE.log(str(self.proxy.report()))
             if done < total_steps(self.settings.train):
                 self._review_before_stage(done)
+            else:
+                correct_final_scale(self._subject(), done)
         # The condition under which nerfstudio saves.
         saves = step > 0 and step % trainer.config.steps_per_save == 0
         if ends or saves or done == trainer._start_step + trainer.config.max_num_iterations:

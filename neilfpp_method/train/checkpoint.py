@@ -23,7 +23,7 @@ __all__ = [
     "save_checkpoint",
 ]
 
-FORMAT = 10
+FORMAT = 11
 """Version of the layout of a run folder and of its checkpoints."""
 LAST = "last"
 """Name of the newest checkpoint; every other one has the name of the stage that it ends."""

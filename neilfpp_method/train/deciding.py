@@ -10,7 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from neilfpp_method.data.pixels.dataset import PixelDataset
+from neilfpp_method.effects.first_light import MIN_PLACES
 from neilfpp_method.effects.following import Followers, follow, improve, start_light
+from neilfpp_method.effects.places import rescaling
+from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.places.search import comparison_due
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
@@ -29,6 +32,7 @@ from neilfpp_method.train.optimizer import Stream, seed_stream
 
 __all__ = [
     "Subject",
+    "correct_final_scale",
     "improve_half_trained",
     "is_improvement_due",
     "review_before_material",
@@ -94,6 +98,25 @@ def improve_half_trained(subject: Subject, position: StagePosition, step: int) -
     seed_stream(subject.seed, Stream.SEARCH, step)
     places = light_places(model, subject.pixels, subject.max_pixels)
     improve(subject, places, comparison, step)
+
+
+def correct_final_scale(subject: Subject, step: int) -> None:
+    """Correct the scale of light and base colour after the last step, when the light is most exact.
+
+    Args:
+        subject: what is measured; its light and its BRDF field may change.
+        step: number of steps trained in all stages.
+    """
+    model, solver = subject.model, subject.light_solver
+    if subject.max_pixels < MIN_PIXELS or not solver.scale_is_free:
+        return
+    seed_stream(subject.seed, Stream.SEARCH, step)
+    places = light_places(model, subject.pixels, subject.max_pixels)
+    if places.shown_count < MIN_PLACES:
+        return
+    rescaled = rescaling.correct_final_scale(model, solver, light_up(model, places))
+    if rescaled is not None:
+        subject.say(rescaled.summary())
 
 
 def _review(subject: Subject, step: int, review: Review, stream: Stream) -> None:

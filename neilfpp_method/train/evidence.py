@@ -26,6 +26,7 @@ from neilfpp_method.train.training import Training
 __all__ = [
     "apply_plan",
     "apply_poses",
+    "correct_final_scale",
     "fit_poses",
     "improve_half_trained",
     "observe_and_solve",
@@ -122,9 +123,19 @@ def improve_half_trained(run: Training, position: StagePosition, step: int) -> N
         with timed("light_fits", undivided=True):
             deciding.improve_half_trained(subject, position, step)
 
-    if not deciding.is_improvement_due(_subject(run), position):
-        return
-    _decide_for_all(run, measure)
+    if deciding.is_improvement_due(_subject(run), position):
+        _decide_for_all(run, measure)
+        _share_material(run)
+
+
+def correct_final_scale(run: Training, step: int) -> None:
+    """Correct the scale of light and base colour after the last step. The first process does this for all."""
+    _decide_for_all(run, lambda subject: deciding.correct_final_scale(subject, step))
+    _share_material(run)
+
+
+def _share_material(run: Training) -> None:
+    """Copy the BRDF field of the first process to all others."""
     if run.fabric.world_size > 1:
         run.model.brdf.load_state_dict(run.fabric.broadcast(run.model.brdf.state_dict()))
 

@@ -43,6 +43,7 @@ from neilfpp_method.train.effects_record import read_plan, write_plan
 from neilfpp_method.train.evidence import (
     apply_plan,
     apply_poses,
+    correct_final_scale,
     fit_poses,
     improve_half_trained,
     observe_and_solve,
@@ -94,9 +95,12 @@ def train(run: Training) -> None:
         if run.fabric.is_global_zero:
             with timed("checks", undivided=True):
                 run.watch.after_stage(model, model.stages[position.stage], run.skipped, step)
-        if step < total_steps(run.config.train):
-            with timed("checks", undivided=True):
+        with timed("checks", undivided=True):
+            if step < total_steps(run.config.train):
                 review_before_stage(run, step)
+            # The review may leave out the joint stage.
+            if step == total_steps(run.config.train):
+                correct_final_scale(run, step)
         _save(run, optimizer, step, names=(position.stage.value, LAST))
         with timed("checks", undivided=True):
             model.eval()

@@ -221,8 +221,7 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
     costs, times = {}, _StageTimes()
     for stage, steps in lengths.items():
         times = _measure_stage(setup, stage, limits.steps / len(lengths), limits.check_time)
-        compared = len(COMPARISONS) if stage is Stage.MATERIAL_INIT else 0
-        searches = compared * SEARCH_SHARE * search.seconds
+        searches = _search_count(stage, with_material) * SEARCH_SHARE * search.seconds
         cost = _cost_of_steps(setup, steps, times, searches)
         if stage in with_material:
             cost = replace(cost, start=surface + places)
@@ -231,6 +230,12 @@ def run_trial(work: Workload, limits: TrialLimits) -> Trial:
         costs[stage.value] = cost
     report = PREVIEWS_PER_REPORT * times.picture if work.report else 0.0
     return Trial(Costs(costs, report), places * len(with_material), search.pixels)
+
+
+def _search_count(stage: Stage, with_material: Sequence[Stage]) -> int:
+    """Number of searches at places in a stage, and after the last stage with material."""
+    compared = len(COMPARISONS) if stage is Stage.MATERIAL_INIT else 0
+    return compared + (1 if stage in with_material[-1:] else 0)
 
 
 def _cost_of_steps(setup: _Setup, steps: int, times: _StageTimes, searches: float) -> StageCost:

@@ -56,3 +56,19 @@ def test_range_holds_for_any_output(kind):
     for values in (material.base_color, material.roughness, material.metallic):
         assert values.min() >= 0
         assert values.max() <= 1
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.3, 40.0])
+def test_base_colors_are_scaled_up_to_1(factor):
+    field, x = BrdfField(*SMALL["hash"], 1.75), positions(100).float()
+    with torch.no_grad():
+        field.mlp.layers[-1].weight.normal_()
+        before = field(x)
+        field.scale_base_color(factor)
+        after = field(x)
+    torch.testing.assert_close(after.base_color, (factor * before.base_color).clamp_max(1.0))
+    assert torch.equal(after.roughness, before.roughness)
+    assert torch.equal(after.metallic, before.metallic)
+    copy = BrdfField(*SMALL["hash"], 1.75)
+    copy.load_state_dict(field.state_dict())
+    assert torch.equal(copy(x).base_color, after.base_color)

@@ -31,10 +31,7 @@ __all__ = ["METAL", "PAINT", "PAINT_OR_METAL", "LitPlaces", "light_up", "neighbo
 PAINT, METAL = range(1), range(1, len(METALLICS))
 """Indices in `METALLICS` of paint and of everything that is metallic."""
 PAINT_OR_METAL = range(0, len(METALLICS), len(METALLICS) - 1)
-"""Indices in `METALLICS` of 0 and 1, for comparisons of lights or lobes. With the values in between, weaker
-light on brighter, slightly metallic surfaces explains the pixels nearly as well: under the true map of
-`tabletop_env`, held-back views preferred a mean base colour of 0.38 in place of 0.29, and without them 0.31.
-"""
+"""Indices in `METALLICS` of 0 and 1. Values in between can make up for errors of the lobe or of the light."""
 NEIGHBOR_PIXELS = 150
 """Number of pixels whose errors are added when the material of a place is chosen: those of the place and of
 its nearest places. An attached loop has few pixels of each place, so it needs more places.
