@@ -1,7 +1,6 @@
-"""Check the shapes of the first calls of every function in each test, and of a share of its later calls.
+"""Check shapes in only some calls: the first ones of each function in a test, and every 16th later one.
 
-On small tensors a check takes as long as the function itself, and loops repeat the shapes of their first
-rounds.
+On small tensors a check takes as long as the function itself. Loops repeat the shapes of their first rounds.
 """
 
 from __future__ import annotations
@@ -18,22 +17,24 @@ import jaxtyping
 Function = TypeVar("Function", bound=Callable)
 
 FIRST = 32
-"""Number of calls of a function that are checked in every test."""
+"""The first calls of a function in each test are all checked, up to this number."""
 EVERY = 16
-"""Of the later calls, every so many is checked."""
+"""A later call is checked if its number is a multiple of this."""
 
 _calls: Counter[CodeType] = Counter()
-"""How often each function was called in the current test. The closures of one function have one code."""
+"""Number of calls in the current test. Closures that one function creates share their code, and are counted
+together.
+"""
 _checked = jaxtyping.jaxtyped
 
 
 def start_test() -> None:
-    """Begin again to count calls."""
+    """Set all numbers of calls to 0."""
     _calls.clear()
 
 
 def check_some_calls() -> None:
-    """Make the import hook of jaxtyping use `jaxtyped`. Modules imported before check every call."""
+    """Make the import hook of jaxtyping use `jaxtyped`. Modules that were imported before check every call."""
     jaxtyping.jaxtyped = jaxtyped
 
 
@@ -48,8 +49,8 @@ def _check_some(function: Function, typechecker: Callable) -> Function:
             function.__init__ = _check_some(function.__init__, typechecker)
         return function
     code = function.__code__
-    # That of a closure is made only if it is needed: it takes longer than most closures. Others are made now,
-    # before a test replaces a class that an annotation names.
+    # To wrap a closure in a check takes longer than most closures run, so this waits for its first checked
+    # call. Other functions are wrapped now, because a test may later replace a class that an annotation names.
     checked = functools.cache(functools.partial(_checked, function, typechecker=typechecker))
     if "<locals>" not in function.__qualname__:
         checked()
