@@ -34,7 +34,7 @@ def start_test() -> None:
 
 
 def check_some_calls() -> None:
-    """Make the import hook of jaxtyping use `jaxtyped`. Modules that were imported before check every call."""
+    """Make the import hook of jaxtyping use `jaxtyped`. Modules imported before this check every call."""
     jaxtyping.jaxtyped = jaxtyped
 
 
@@ -50,7 +50,7 @@ def _check_some(function: Function, typechecker: Callable) -> Function:
         return function
     code = function.__code__
     # To wrap a closure in a check takes longer than most closures run, so this waits for its first checked
-    # call. Other functions are wrapped now, because a test may later replace a class that an annotation names.
+    # call. Other functions are wrapped now: a test may later replace a class that an annotation names.
     checked = functools.cache(functools.partial(_checked, function, typechecker=typechecker))
     if "<locals>" not in function.__qualname__:
         checked()
