@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
@@ -61,22 +62,29 @@ def with_prior(errors: Mapping[float, float], response: str) -> dict[float, floa
     return {scale: error + weight * math.log(scale / USUAL_SCALE) ** 2 for scale, error in errors.items()}
 
 
-def lowest_scale(errors: Mapping[float, float]) -> float:
+def lowest_scale(errors: Mapping[float, float], max_rise: float = 0.0) -> float:
     """The scale of the lowest error.
 
-    At an end of the range it is the scale that was tried; within the range it is the minimum of the parabola
-    through the lowest error and its two neighbours, over the logarithm of the scale.
+    At an end of the range it is the scale that was tried. Within the range it is the minimum of a parabola
+    over the logarithm of the scale, between the neighbours of the lowest error.
+
+    Args:
+        errors: the error at each scale.
+        max_rise: the parabola fits the lowest error, its two neighbours, and all errors that are higher by at
+            most this share. The more errors it fits, the less the noise of each of them matters.
     """
     scales = sorted(errors)
     number = min(range(len(scales)), key=lambda n: errors[scales[n]])
+    lowest = scales[number]
     if number in (0, len(scales) - 1):
-        return scales[number]
-    left, middle, right = (math.log(scales[n]) for n in (number - 1, number, number + 1))
-    rise_left = (errors[scales[number]] - errors[scales[number - 1]]) / (middle - left)
-    rise_right = (errors[scales[number + 1]] - errors[scales[number]]) / (right - middle)
-    bend = (rise_right - rise_left) / ((right - left) / 2)
-    slope = (rise_left * (right - middle) + rise_right * (middle - left)) / (right - left)
-    return math.exp(min(max(middle - slope / bend, left), right)) if bend > 0 else scales[number]
+        return lowest
+    neighbors = scales[number - 1 : number + 2]
+    limit = (1 + max_rise) * errors[lowest]
+    fitted = [scale for scale in scales if scale in neighbors or errors[scale] <= limit]
+    bend, slope, _ = np.polyfit(np.log(fitted) - math.log(lowest), [errors[scale] for scale in fitted], deg=2)
+    if bend <= 0:
+        return lowest
+    return min(max(lowest * math.exp(-slope / (2 * bend)), neighbors[0]), neighbors[2])
 
 
 def scale_of_metals(
