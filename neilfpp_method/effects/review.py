@@ -240,10 +240,11 @@ def review_metals(plan: Plan, model: NeilfModel, lit: LitPlaces, step: int) -> l
     """
     if model.brdf.metals or not plan.is_open("metals"):
         return []
-    decision = plan.decide("metals", metals_evidence_in(lit, model.facts.response), step)
+    response = model.facts.response
+    decision = plan.decide("metals", metals_evidence_in(lit, response), step)
     if decision.on:
         model.use(plan.config)
-        teach(model.brdf, find_metal(lit, model.brdf))
+        teach(model.brdf, find_metal(lit, model.brdf, response))
     return [decision]
 
 
