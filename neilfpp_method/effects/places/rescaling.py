@@ -25,6 +25,8 @@ __all__ = ["FACTORS", "Rescaled", "correct_final_scale", "correct_scale"]
 
 FACTORS = (0.59, 0.7, 0.84, 1.0, 1.19, 1.41, 1.68)
 """Factors on base colour that are tried, in equal steps of the logarithm. Initial scales are off by less."""
+MAX_MEAN = 0.9
+"""Largest mean base colour that a factor above 1 may lead to: that of fresh snow."""
 FOLDS = 5
 """Number of folds of the views. Each of them is held back once."""
 MAX_RISE = 0.05
@@ -100,10 +102,11 @@ def _find_correction(model: NeilfModel, solver: LightSolver, lit: LitPlaces) -> 
         return None
     mean = current.base_color.clamp_min(DARK_FLOOR).log().mean().exp().item()
     painted = lit.where(torch.nonzero(is_paint[lit.places.place])[:, 0])
-    errors = dict.fromkeys((mean * factor for factor in FACTORS), 0.0)
+    factors = [factor for factor in FACTORS if factor <= 1 or factor * mean <= MAX_MEAN]
+    errors = dict.fromkeys((mean * factor for factor in factors), 0.0)
     for number in range(FOLDS):
         split = painted.hold_back(number, FOLDS)
-        for factor in FACTORS:
+        for factor in factors:
             material = split.known.dimmed(factor).best(PAINT).material
             error = split.held_back.dimmed(factor).error(material)
             errors[mean * factor] += error.abs().clamp_max(1).mean().item() / FOLDS

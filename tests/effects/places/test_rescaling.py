@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import nn
 
+from neilfpp_method.effects.places import rescaling
 from neilfpp_method.effects.places.gathering import Places
 from neilfpp_method.effects.places.lit import light_up
 from neilfpp_method.effects.places.rescaling import correct_final_scale, correct_scale
@@ -69,6 +70,15 @@ def test_after_the_last_step_diffuse_light_stays_exactly_the_same(places: Places
         correct_final_scale(model, solver, light_up(model, places))
         after = model.brdf(places.observed.position).base_color * model.light.log_radiance.exp().mean()
     torch.testing.assert_close(after, before)
+
+
+def test_no_surface_becomes_brighter_than_snow(places: Places, monkeypatch):
+    """Even if the brightest scale has the lowest error."""
+    model, solver = mis_scaled(2.0, places)
+    monkeypatch.setattr(rescaling, "lowest_scale", lambda errors, max_rise: max(errors))
+    rescaled = correct_scale(model, solver, light_up(model, places))
+    assert rescaled.factor > 1
+    assert rescaled.before * rescaled.factor <= 0.9
 
 
 def test_a_known_scale_is_not_changed(places: Places):
