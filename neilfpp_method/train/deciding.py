@@ -14,7 +14,7 @@ from neilfpp_method.effects.first_light import MIN_PLACES
 from neilfpp_method.effects.following import Followers, follow, improve, start_light
 from neilfpp_method.effects.places import rescaling
 from neilfpp_method.effects.places.lit import light_up
-from neilfpp_method.effects.places.search import comparison_due
+from neilfpp_method.effects.places.search import comparison_due, is_comparable
 from neilfpp_method.effects.plan import Decision, Plan
 from neilfpp_method.effects.review import (
     MAX_PIXELS,
@@ -108,7 +108,7 @@ def correct_final_scale(subject: Subject, step: int) -> None:
         step: number of steps trained in all stages.
     """
     model, solver = subject.model, subject.light_solver
-    if subject.max_pixels < MIN_PIXELS or not solver.scale_is_free:
+    if subject.max_pixels < MIN_PIXELS or not is_comparable(model) or not solver.scale_is_free:
         return
     seed_stream(subject.seed, Stream.SEARCH, step)
     places = light_places(model, subject.pixels, subject.max_pixels)

@@ -79,3 +79,19 @@ def test_the_final_correction_is_printed(
     assert len(said) == 1
     assert f"mean base colour {1.3 * BASE_COLOR:.2f} → " in said[0]
     assert model.brdf.base_color_scale.item() == pytest.approx(1 / 1.3, rel=0.06)
+
+
+def test_without_highlights_the_scale_is_not_corrected(
+    capture: Path,
+    tmp_path: Path,
+    monkeypatch,
+    places: Places,  # noqa: F811
+) -> None:
+    """Diffuse reflection alone does not reveal it."""
+    run, said = small_training(capture, tmp_path, small_config()), []
+    model, solver = mis_scaled(1.3, places)
+    model.lobe = None
+    monkeypatch.setattr(deciding, "light_places", lambda *_: places)
+    correct_final_scale(Subject(run.plan, model, solver, said.append, run.pixels, 0), step=12)
+    assert said == []
+    assert model.brdf.base_color_scale.item() == 1

@@ -120,7 +120,7 @@ def _share_of_clear_metal(lit: LitPlaces) -> Measurement:
 
 
 def _loss_in_held_back_views(lit: LitPlaces, metallics: range) -> Float[Tensor, " P"]:
-    """The loss of each place in every fold, with the best material for the other views."""
+    """The loss of each place, summed over the held-back folds, with the best material for the other views."""
     splits = (lit.hold_back(fold, FOLDS_UNDER_LIGHT) for fold in range(FOLDS_UNDER_LIGHT))
     return sum(split.held_back.loss(split.known.best(metallics).material) for split in splits)
 

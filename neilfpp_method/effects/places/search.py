@@ -43,6 +43,7 @@ __all__ = [
     "SearchedMaterial",
     "comparison_due",
     "found_in",
+    "is_comparable",
     "search_materials",
     "teach",
 ]
@@ -119,14 +120,14 @@ class SearchedMaterial:
     share: float
 
 
-def comparison_due(model: NeilfModel, position: StagePosition) -> Comparison | None:
-    """What is compared after `position.step` steps of a stage (`review.improve_material`), or None.
+def is_comparable(model: NeilfModel) -> bool:
+    """Whether materials can be compared at places: under an environment map, and with highlights."""
+    return model.lobe is not None and isinstance(model.light, EnvironmentLight)
 
-    Nothing is compared if the light is not an environment map, or if the settings leave out highlights.
-    """
-    if model.lobe is None or not isinstance(model.light, EnvironmentLight):
-        return None
-    if position.stage is not Stage.MATERIAL_INIT:
+
+def comparison_due(model: NeilfModel, position: StagePosition) -> Comparison | None:
+    """What is compared after `position.step` steps of a stage (`review.improve_material`), or None."""
+    if not is_comparable(model) or position.stage is not Stage.MATERIAL_INIT:
         return None
     reached = [c for share, c in COMPARISONS.items() if _has_reached(position, share)]
     return reached[-1] if reached else None
